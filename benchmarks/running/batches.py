@@ -12,7 +12,6 @@ import jax
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -152,7 +151,7 @@ class Batches:
             means.worlds,
             Listeners(take, self.busy, self.compiling),
             RunSettings(
-                recogniser=recogniser(method.recognition, target),
+                recogniser=method.recogniser(target),
                 protocol=method.terms,
                 trials=means.trials,
                 at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -65,7 +64,7 @@ def run_settings(method: Method, target: Target) -> RunSettings:
       InputError: its recogniser lacks weights, or trials cannot be made.
     """
     return RunSettings(
-        recogniser=recogniser(method.recognition, target),
+        recogniser=method.recogniser(target),
         max_steps=method.config.max_steps,
         options=method.options(),
         protocol=method.terms,

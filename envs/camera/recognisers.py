@@ -3,11 +3,11 @@
 - `informed` returns the true shapes and poses, and the target's from the start.
 - `oracle` returns the true shapes and poses.
 - `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
-- `full` receives the noisy depth image alone and segments it.
+- `full` receives a noisy depth and a noisy colour image alone and segments them.
 
-`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. For all but `informed` the detector
-decides whether the target is seen; of those only the oracle gets the target's pose. `full` gets the target's pixels
-once the detector sees the target; until then they look to it like those of one more object.
+`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. `oracle` and `masks` are told whether
+the target shows more than 100 pixels, and `masks` then which; only the oracle gets the target's pose. `full` finds the
+target by itself in a depth and a colour image, by `images.detection.detect`, as on a robot.
 """
 
 from __future__ import annotations
@@ -21,11 +21,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.envs.camera.colour_image import ColourSensing, drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.sensing import Sensing, true_camera
-from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.simulated_camera import Image, observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.images.cloud import MARGIN, View, above_board
+from mechsearch_jax.images.colour import TargetColour
+from mechsearch_jax.images.detection import Detection, detect
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.networks.weights import Weights, shipped_weights
@@ -36,7 +39,6 @@ from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -132,24 +134,11 @@ def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"
     return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)
 
 
-class Depth(Protocol):
-    """Derives the depth image that shapes are fitted to."""
-
-    def __call__(
-        self, camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]
-    ) -> Float[Array, "h w"]:
-        """The depth of measured points [m], NaN where nothing was measured; see `noise.measured_depth`."""
-        ...
-
-
-def only_measured(camera: Camera, depth: Array, points: Array) -> Array:
-    """The `Depth` of the measured points alone: NaN where nothing was measured."""
-    return depth_of(camera, points)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageRecogniser:
-    """The `Recogniser` that sees a depth image. Recognised shapes have the edges of `superquadric.standard_edges`.
+    """The `Recogniser` that sees a depth image with masks.
+
+    Recognised shapes have the edges of `superquadric.standard_edges`.
 
     Attributes:
       target: its shape.
@@ -157,7 +146,6 @@ class ImageRecogniser:
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
-      depth: derives the depth image; the default also marks where the true image shows nothing, as true masks do.
     """
 
     target: Target
@@ -165,7 +153,6 @@ class ImageRecogniser:
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
-    depth: Depth = measured_depth
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view, shelf = snapshot.view, snapshot.shelf
@@ -206,17 +193,117 @@ def labelled(
     points = noise(keys[0], view.camera, image.depth)
     masks = true_labels(points, image.segmentation, shelf)
     labels = recogniser.labeller(keys[1], shelf, points, (image.segmentation == TARGET) & target_seen, masks, unseen)
-    depth = recogniser.depth(view.camera, image.depth, points)
+    # Where the true image shows nothing is marked, as in true masks.
+    depth = measured_depth(view.camera, image.depth, points)
     return LabelledImage(points, depth, labels, (masks == TARGET) & target_seen)
 
 
-@functools.cache
-def recogniser(name: str, target: Target) -> Recogniser:
+@dataclasses.dataclass(frozen=True, eq=False)
+class ColourRecogniser:
+    """The `Recogniser` that sees a depth and a colour image, and nothing else.
+
+    Objects have random colours, which belong to the scene. Recognised shapes have the edges of
+    `superquadric.standard_edges`.
+
+    Attributes:
+      target: its shape.
+      detector: finds the target's colour, which is the target's true one.
+      labeller: says which pixels show which object.
+      weights: of the recognition network.
+      noise: of the depth sensor.
+      camera: of colours, where `Snapshot.sensing` says nothing.
+      refinement: how recognised shapes are refined.
+      detects_target: see `snapshot.truly_in_sight`.
+    """
+
+    target: Target
+    detector: TargetColour
+    labeller: Labeller
+    weights: Weights
+    noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
+    camera: ColourSensing = dataclasses.field(default_factory=ColourSensing)
+    refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
+    detects_target: bool = True
+
+    def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
+        view, shelf = snapshot.view, snapshot.shelf
+        keys = jax.random.split(key, 4)
+        unseen = found_pixels(snapshot.camera) / view.stride**2
+        image, seen = detected(keys[:2], self, view, shelf, snapshot.world, unseen, snapshot.sensing)
+        shapes = ShapeNetwork.of(self.weights)
+        objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
+        return Observation(objects, seen, pose)
+
+
+def sighted(
+    key: Key[Array, ""],
+    recogniser: ColourRecogniser,
+    view: View,
+    shelf: Shelf,
+    world: World,
+    unseen: float,
+    sensing: Sensing | None = None,
+) -> tuple[Image, Float[Array, "h w 3"], Float[Array, "h w"], Detection]:
+    """The true image, the measured points and their depth, and the target that is detected.
+
+    Args:
+      key: of the noise.
+      recogniser, view, shelf, world, unseen, sensing: see `detected`.
+    """
+    camera = recogniser.camera if sensing is None or sensing.colour is None else sensing.colour
+    appearance = drawn_appearance(scene_key(world), recogniser.detector.rgb, camera.hue_gap)
+    image = observe(true_camera(view.camera, sensing), world, shelf, appearance)
+    noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
+    points = noise(key, view.camera, image.depth)
+    depth = depth_of(view.camera, points)
+    # The noise of the depth takes 0 to 2 of this key, see `OtherNoise`.
+    colour = sensed_colour(jax.random.fold_in(key, 3), image.colour, camera)
+    detection = detect(
+        jax.random.fold_in(key, 4),
+        recogniser.detector,
+        recogniser.target,
+        shelf,
+        view.camera,
+        points,
+        depth,
+        colour,
+        unseen,
+    )
+    return image, points, depth, detection
+
+
+@kept(static_argnames=("recogniser", "unseen"))
+def detected(
+    keys: Key[Array, "2"],
+    recogniser: ColourRecogniser,
+    view: View,
+    shelf: Shelf,
+    world: World,
+    unseen: float,
+    sensing: Sensing | None = None,
+) -> tuple[LabelledImage, Bool[Array, ""]]:
+    """The labelled image that a recogniser fits shapes to, and whether it shows the target.
+
+    Args:
+      keys: of the noise, and of the labeller.
+      recogniser: static.
+      view, shelf, world, sensing: see `labelled`.
+      unseen: a target of at most this many pixels of the view is not detected; static.
+    """
+    image, points, depth, detection = sighted(keys[0], recogniser, view, shelf, world, unseen, sensing)
+    numbers = true_labels(points, image.segmentation, shelf)
+    labels = recogniser.labeller(keys[1], shelf, points, detection.pixels, numbers, unseen)
+    of_target = detection.pixels & above_board(shelf, points) & detection.visible
+    return LabelledImage(points, depth, labels, of_target), detection.visible
+
+
+def recogniser(name: str, target: Target, detector: TargetColour | None = None) -> Recogniser:
     """The recogniser of a name; the same object for the same arguments, so that nothing is compiled twice.
 
     Args:
       name: one of `RecognitionName`.
       target: whose shape is given.
+      detector: of the target's colour, for `full`; `TargetColour.lit()`, red, if None.
 
     Raises:
       InputError: there is no recogniser of that name, or its weights are missing or damaged.
@@ -225,7 +312,15 @@ def recogniser(name: str, target: Target) -> Recogniser:
         raise InputError(f'recognition "{name}" is unknown; use {", ".join(get_args(RecognitionName))}')
     if name in _TRUE:
         return _TRUE[name]
-    shapes = shipped_weights("recognition")
-    if name == "masks":
-        return ImageRecogniser(target, true_masks, shapes)
-    return ImageRecogniser(target, Segmenter(shipped_weights("segmentation")), shapes, depth=only_measured)
+    return _with_masks(target) if name == "masks" else _alone(target, detector or TargetColour.lit())
+
+
+@functools.cache
+def _with_masks(target: Target) -> ImageRecogniser:
+    return ImageRecogniser(target, true_masks, shipped_weights("recognition"))
+
+
+@functools.cache
+def _alone(target: Target, detector: TargetColour) -> ColourRecogniser:
+    segmenter = Segmenter(shipped_weights("segmentation"))
+    return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"))

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from mechsearch_jax.envs.camera.colour_image import ColourSensing
 from mechsearch_jax.envs.world.mismatch import ActualCell, Mismatch
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -60,22 +61,28 @@ class Sensing(flax.struct.PyTreeNode):
     Attributes:
       place: where the world is; None where the planner takes it to be.
       noise: of the depth; None for the recogniser's.
+      colour: of the colour image; None for the recogniser's.
     """
 
     place: Place | None = None
     noise: OtherNoise | None = None
+    colour: ColourSensing | None = None
 
 
 def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
     """The sensing of an episode, as NumPy arrays; None if it is as the planner assumes."""
-    place, noise = None, None
+    place, noise, colour = None, None, None
     if mismatch.moves_camera:
         T_base_world = np.linalg.inv(cell.T_world_base)
         T_seen_world = np.linalg.inv(cell.T_base_moved) @ T_base_world
         place = Place(*(np.asarray(T, np.float32) for T in (T_base_world, T_seen_world)))
     if mismatch.measures_otherwise:
         noise = OtherNoise(*(np.asarray(n, np.float32) for n in (mismatch.depth_noise, mismatch.missing_depth)))
-    return None if place is None and noise is None else Sensing(place, noise)
+    if mismatch.colours_otherwise:
+        numbers = (mismatch.color_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
+        colour = ColourSensing(*(np.asarray(n, np.float32) for n in numbers))
+    parts = place, noise, colour
+    return None if all(part is None for part in parts) else Sensing(*parts)
 
 
 def true_camera(camera: Camera, sensing: Sensing | None) -> Camera:

@@ -66,6 +66,18 @@ class Image(flax.struct.PyTreeNode):
     colour: jax.Array
 
 
+class Appearance(flax.struct.PyTreeNode):
+    """How the bodies and the shelf look.
+
+    Attributes:
+      colours: red, green and blue in 0 to 1 of each object's slot, the target and the shelf, shape (10, 3).
+      light: the direction towards the light, in the world, of any length, shape (3,).
+    """
+
+    colours: jax.Array | np.ndarray
+    light: jax.Array | np.ndarray
+
+
 def _local(rotation: Array, vector: Array) -> list[Array]:
     """The components of world vectors (..., 3) in a body's frame."""
     x, y, z = (vector[..., k] for k in range(3))
@@ -145,27 +157,35 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
 
 
 @kept()
-def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
+def observe(camera: Camera, world: World, shelf: Shelf | None = None, appearance: Appearance | None = None) -> Image:
     """The camera's image of the shelf and everything on it; the robot is out of the way.
 
     Args:
       camera: the camera.
       world: the bodies.
       shelf: the shelf; the default shelf if None.
+      appearance: of everything in the image; that of pictures, `PALETTE` in the light from `LIGHT`, if None.
     """
     shelf = shelf or Shelf()
+    appearance = Appearance(PALETTE, np.array(LIGHT)) if appearance is None else appearance
     directions = rays(camera)
     depth, owner = _cast_bodies(camera, world, directions)
     behind = cast_shelf(camera, shelf, directions)
     owner = jnp.where(behind < depth, jnp.int8(SHELF), owner)
     depth = jnp.minimum(depth, behind)
 
-    light = np.array(LIGHT) / np.linalg.norm(LIGHT)
+    light = _unit(appearance.light)
     normals = _normals(camera, shelf, world, directions, depth, owner)
     shade = AMBIENT + (1.0 - AMBIENT) * jnp.maximum(sum(normals[..., k] * light[k] for k in range(3)), 0.0)
-    colour = jnp.asarray(PALETTE)[jnp.clip(owner, 0, SHELF)] * shade[..., None]
+    colour = jnp.asarray(appearance.colours)[jnp.clip(owner, 0, SHELF)] * shade[..., None]
     colour = jnp.where((owner == BACKGROUND)[..., None], jnp.array([[BACKGROUND_COLOUR]]), colour)
     return Image(depth, owner, colour)
+
+
+def _unit(vector: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+    """A vector of length 1, by the library of the argument, so that a constant stays as exact as it is."""
+    library = np if isinstance(vector, np.ndarray) else jnp
+    return vector / library.linalg.norm(vector)
 
 
 def target_window(camera: Camera) -> int:

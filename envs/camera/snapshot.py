@@ -98,6 +98,21 @@ class Recogniser(Protocol):
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation: ...
 
 
+@runtime_checkable
+class Detects(Protocol):
+    """A recogniser that may take the target for visible where it is not, or not for visible where it is."""
+
+    @property
+    def detects_target(self) -> bool: ...
+
+
+def truly_in_sight(recogniser: Recogniser, snapshot: Snapshot) -> Bool[Array, ""]:
+    """Whether a target that the planner takes as found counts as found: where a recogniser detects it by itself, the
+    image must truly show enough of it; others are told, and it always counts."""
+    detects = isinstance(recogniser, Detects) and recogniser.detects_target
+    return snapshot.target_seen if detects else jnp.array(True)
+
+
 def oracle(key: Array, snapshot: Snapshot) -> Observation:
     """The `Recogniser` of the true shapes and poses; the target's once the detector sees it. Ignores the key.
 

@@ -185,9 +185,11 @@ class EpisodePool:
             knowledge = self._planner.look(world, environment_keys, list(logs))
         found, lost = knowledge.found, self._target_troubles(world, list(logs))
         trouble = {r: reason for r, reason in lost.items() if found[r]}
-        to_judge = [r for r in logs if found[r] and r not in trouble]
+        # What the planner takes for the target may be something else, of which there is no verdict.
+        truly_found = found & knowledge.shown
+        to_judge = [r for r in logs if truly_found[r] and r not in trouble]
         # After the last action the target may still be taken out, where it is found.
-        deciding = [r for r in logs if r in to_judge or not (found[r] or logs[r].last)]
+        deciding = [r for r in logs if r not in trouble and (found[r] or not logs[r].last)]
         with clock("plan", deciding):
             choices = self._planner.decide(planner_keys, deciding)
         choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
@@ -204,7 +206,7 @@ class EpisodePool:
             choice = None if r in trouble else choices.get(r)
             size = 1 if found[r] else int(knowledge.size[r])
             truth = None if found[r] or r in lost else bool(knowledge.truth[r])
-            log.decide(record(bool(found[r]), size, verdict, choice, truth, int(knowledge.restarts[r])))
+            log.decide(record(bool(truly_found[r]), size, verdict, choice, truth, int(knowledge.restarts[r])))
         return self._act({r: choice for r, choice in choices.items() if r not in trouble}, trouble)
 
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.camera.snapshot import Recogniser
 from mechsearch_jax.envs.episode.policy_numbers import mould
 from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.pushing.push_models import push_models
@@ -19,6 +20,7 @@ from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConf
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.target import Target
 
 # What the options of an episode hold beside the configuration's.
 _OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
@@ -70,6 +72,14 @@ class Method:
         """The trials of the policy's best actions; None without a rehearsal."""
         return rehearsal(self.config.rehearsal)
 
+    def recogniser(self, target: Target) -> Recogniser:
+        """The recogniser of its episodes with a target.
+
+        Raises:
+          InputError: its weights are missing or damaged.
+        """
+        return recogniser(self.recognition, target, self.workcell.detector)
+
     @property
     def terms(self) -> EpisodeProtocol:
         """The protocol of its episodes."""
@@ -102,7 +112,7 @@ class Method:
         self.mismatch.check(self.recognition, self.engine)
         check_kinds(self.config.problem.actions.actions)
         self.policy()
-        recogniser(self.recognition, self.workcell.target)
+        self.recogniser(self.workcell.target)
 
     def options(self) -> dict[str, Any]:
         """The options that identify this method, flat and as JSON values.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot
+from mechsearch_jax.envs.camera.snapshot import Detects, Recogniser, Snapshot
 from mechsearch_jax.envs.episode.episode_log import Choice, takes_target
 from mechsearch_jax.envs.episode.slots import Slots
 from mechsearch_jax.envs.episode.verdicts import Verdict
@@ -186,6 +186,11 @@ class WithTruePose:
     """A `Recogniser` that replaces the pose of a seen target by the true one, as the oracle sees it."""
 
     inner: Recogniser
+
+    @property
+    def detects_target(self) -> bool:
+        """As of the inner recogniser."""
+        return isinstance(self.inner, Detects) and self.inner.detects_target
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         return self.inner(key, snapshot).replace(target_pose=snapshot.target_pose)

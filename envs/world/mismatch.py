@@ -28,6 +28,9 @@ PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "sof
 FARTHEST, STEEPEST = 0.2, 20.0
 # Standard deviation of the usual depth noise [m].
 USUAL_NOISE = 0.001
+# Standard deviation of the usual noise in each channel of colour, and the usual least difference of the objects' hues
+# from the target's [degrees].
+USUAL_COLOUR_NOISE, USUAL_HUE_GAP = 4 / 255, 40.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +49,10 @@ class Mismatch:
         shift [m], and a turn [degrees] about the middle of the board.
       depth_noise: standard deviation of the measured points' distance from the true ones [m].
       missing_depth: share of pixels without a measurement, below 1.
+      color_noise: standard deviation of each channel of the colour image, in shares of full brightness.
+      exposure: factor on all channels of the colour image.
+      white_balance: share by which red is too strong in it and blue too weak.
+      hue_gap: least difference of the objects' hues from the target's [degrees]; 0 for any colour.
     """
 
     friction: float = option(1.0, "factor on the simulated world's sliding frictions")
@@ -57,6 +64,10 @@ class Mismatch:
     shelf_turn: float = option(0.0, "by how much the shelf is turned about its middle [degrees]")
     depth_noise: float = option(USUAL_NOISE, "standard deviation of the simulated depth camera's noise [m]")
     missing_depth: float = option(0.0, "share of pixels for which no depth is measured")
+    color_noise: float = option(USUAL_COLOUR_NOISE, "standard deviation of the simulated color camera's noise, 0 to 1")
+    exposure: float = option(1.0, "factor on the brightness of the simulated color image")
+    white_balance: float = option(0.0, "share by which red is too strong and blue too weak in the color image")
+    hue_gap: float = option(USUAL_HUE_GAP, "least difference of the objects' hues from the target's [degrees]")
 
     def __post_init__(self):
         for name, low, high, unit in (
@@ -68,6 +79,10 @@ class Mismatch:
             ("shelf_turn", 0.0, STEEPEST, "degrees"),
             ("depth_noise", 0.0, 1.0, "m"),
             ("missing_depth", 0.0, 0.99, ""),
+            ("color_noise", 0.0, 1.0, ""),
+            ("exposure", 0.01, 100.0, ""),
+            ("white_balance", -0.9, 0.9, ""),
+            ("hue_gap", 0.0, 180.0, "degrees"),
         ):
             check_range(f"Mismatch: {name}", getattr(self, name), low, high, unit)
             # Convert to one type, for rows keep what was given.
@@ -91,13 +106,19 @@ class Mismatch:
         return self.depth_noise != USUAL_NOISE or self.missing_depth > 0.0
 
     @property
+    def colours_otherwise(self) -> bool:
+        """Whether the colour image differs from the usual."""
+        usual = USUAL_COLOUR_NOISE, 1.0, 0.0, USUAL_HUE_GAP
+        return (self.color_noise, self.exposure, self.white_balance, self.hue_gap) != usual
+
+    @property
     def simulates_otherwise(self) -> bool:
         """Whether the simulator has to differ from the usual."""
         return self.moves_robot or (self.friction, self.mass, self.physics) != (1.0, 1.0, "usual")
 
     def mould(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
-        return self.moves_camera, self.measures_otherwise
+        return self.moves_camera, self.measures_otherwise, self.colours_otherwise
 
     def check(self, recognition: str, engine: str) -> None:
         """Check that episodes with a recogniser and a simulator, by their names, can have this mismatch.
@@ -107,6 +128,10 @@ class Mismatch:
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
             raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
+        if recognition != "full" and self.colours_otherwise:
+            raise InputError(
+                "--color-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
+            )
         if engine != "NativeSimulator" and self.physics != "usual":
             raise InputError("--world-physics: the batch simulator has the usual physics; add --simulator native")
 

@@ -26,7 +26,6 @@ def inspect(
     """
     from rich.progress import track
 
-    from mechsearch_jax.envs.camera.recognisers import recogniser
     from mechsearch_jax.envs.episode.episodes import target_of
     from mechsearch_jax.envs.recording.pictures import inspect_scenario
     from mechsearch_jax.problem.cache import keep_compilations
@@ -51,7 +50,7 @@ def inspect(
     problems = {target: workcell.problem(target, method.config.problem) for target in set(targets.values())}
     for scene in track(scenes.values(), "inspecting"):
         target = targets[scene.name]
-        maps, figure = inspect_scenario(scene, problems[target], recogniser(method.recognition, target), seed)
+        maps, figure = inspect_scenario(scene, problems[target], method.recogniser(target), seed)
         save_maps(maps, out / f"{scene.name}.npz")
         save_figure(figure, out / f"{scene.name}.png")
     print(f"{len(scenes)} scenario{'s' if len(scenes) > 1 else ''} inspected: {out}")

@@ -100,7 +100,6 @@ def _run(
     first = first_decision(problem, policy, SimulatorConfig().motion)
     with prepared(first, lambda text: console.print(text, style="dim")):
         # These take long to import; meanwhile the first decision's program is read or compiled.
-        from mechsearch_jax.envs.camera.recognisers import recogniser
         from mechsearch_jax.envs.recording.narration import Narrator
         from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
         from mechsearch_jax.envs.simulators.native import NativeSimulator
@@ -111,7 +110,7 @@ def _run(
         recorder = Recorder(simulator)
         narrator = Narrator(console, status, problem, recorder.note)
         settings = RunSettings(
-            recogniser=recogniser(chosen.recognition, problem.target),
+            recogniser=chosen.recogniser(problem.target),
             max_steps=chosen.config.max_steps,
             options=chosen.options(),
             protocol=chosen.terms,

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
+from mechsearch_jax.images.detection import detect, no_detection
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.images.target_pixels import coloured_pixels, fitted_pose, near_target
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
@@ -200,28 +200,26 @@ def _labelled(
 
     # Points on the board's faces may be the target's.
     near = above_board(shelf, points, -MARGIN)
-    coloured = jnp.zeros(seen.shape, bool)
+    threshold = found_pixels(camera) / view.stride**2
+    detection = no_detection(seen)
     if colour is not None:
         pixels = view.of(jnp.asarray(colour))
         scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
-        coloured = coloured_pixels(recogniser.detector, pixels.astype(jnp.float32) / scale, seen) & near
-    # Casts avoid weak types, with which functions of the observation would be compiled again.
-    enough = found_pixels(camera) / view.stride**2
-    visible = (jnp.sum(coloured) > enough).astype(bool)
+        pixels = pixels.astype(jnp.float32) / scale
+        detection = detect(
+            key, recogniser.detector, recogniser.target, shelf, view.camera, points, seen, pixels, threshold
+        )
+    visible = detection.visible
     if mask is None:
-        pose, _ = fitted_pose(jax.random.fold_in(key, 0), recogniser.target, shelf, view.camera, points, coloured)
-        on_it = near_target(recogniser.target, shelf, pose, points) & near & visible
-        # The pose is unreliable if it would add more pixels than the colour shows.
-        on_it &= jnp.sum(on_it & ~coloured) <= jnp.sum(coloured)
-        of_target = coloured | on_it
+        of_target = detection.pixels
         labels = recogniser.segmenter(key, shelf, points, of_target)
     else:
         instances = _instances(view.of(jnp.asarray(mask)))
-        of_target, freed = _target_in(instances, coloured, target_id)
+        of_target, freed = _target_in(instances, detection.coloured, target_id)
         of_target &= near
         labels = _labels(instances, freed, shelf, points)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
-        visible = (jnp.sum(of_target) > enough).astype(bool)
+        visible = (jnp.sum(of_target) > threshold).astype(bool)
     return LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible), visible
 
 
