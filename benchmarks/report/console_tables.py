@@ -26,6 +26,33 @@ def plain_table(title: str | None = None) -> Table:
     return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left")
 
 
+def detection_table(figures: Mapping[str, Any]) -> Table:
+    """What is detected under every condition, as `detection.detection_figures` returns it, and in all."""
+    table = plain_table("detection of the target")
+    for name in (
+        "target",
+        "exposure",
+        "noise /255",
+        "red too strong",
+        "hue gap",
+        "missed",
+        "false",
+        "precision",
+        "recall",
+    ):
+        table.add_column(name, justify="left" if name == "target" else "right")
+    for line in figures["conditions"]:
+        light = (line["exposure"], line["noise"], line["white_balance"], line["hue_gap"])
+        table.add_row(line["target"], *(f"{number:g}" for number in light), *_detected(line))
+    table.add_row("all", *[""] * 4, *_detected(figures["all"]), style="bold")
+    return table
+
+
+def _detected(line: Mapping[str, Any]) -> list[str]:
+    shares = ("-" if line[name] is None else f"{line[name]:.3f}" for name in ("precision", "recall"))
+    return [f"{line['missed']}/{line['in_sight']}", f"{line['false']}/{line['out_of_sight']}", *shares]
+
+
 def timing_table(timing: Timing) -> Table:
     """One timing, and what it was measured on."""
     table = Table(box=None, pad_edge=False, show_header=False)

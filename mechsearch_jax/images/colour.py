@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 import dataclasses
 import functools
 import math
@@ -16,15 +17,15 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from mechsearch_jax.images.labels import OTHER
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_range
 
 # Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).
 ColourDifference = Callable[[Array, Array], Array]
 
 # The target's colour, if none is given: the paper's red.
 RED = (0.7282, 0.1558, 0.2099)
-# Largest difference of equal hues [rad]: a fourth of the way from red to yellow.
-HUE = math.radians(15.0)
+# Largest difference of equal hues [degrees], a fourth of the way from red to yellow, and the largest that may be set.
+HUE, LARGEST_HUE = 15.0, 60.0
 # A colour of the target's hue counts as the target's with at least this share of its saturation.
 SATURATION = 0.7
 # Least chroma of a pixel; below it the hue is noise.
@@ -68,19 +69,37 @@ def _opponents(colours: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch"
     return red - 0.5 * (green + blue), (0.5 * math.sqrt(3.0)) * (green - blue)
 
 
-def hue_difference(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
+def hue_difference(
+    colours: Float[Array, "*batch 3"], reference: Float[Array, "3"], tolerance: float = HUE
+) -> Float[Array, "*batch"]:
     """Difference from a reference in hue or saturation, whichever is larger; 1 at the tolerance of either.
 
-    The difference in hue is the angle between the two in the plane perpendicular to the axis of greys, over `HUE`. A
-    saturation below the reference's counts relative to its tolerance; one above does not count. Neither depends on
-    brightness. Colours below `LEAST_CHROMA` are infinitely different.
+    The difference in hue is the angle between the two in the plane perpendicular to the axis of greys, over `tolerance`
+    [degrees]. A saturation below the reference's counts relative to its tolerance; one above does not count. Neither
+    depends on brightness. Colours below `LEAST_CHROMA` are infinitely different.
     """
     a, b = _opponents(colours)
     x, y = _opponents(reference.reshape([1] * (colours.ndim - 1) + [3]))
     turn = jnp.abs(jnp.arctan2(a * y - b * x, a * x + b * y))
     full = saturation(reference)
     lack = (full - saturation(colours)) / ((1.0 - SATURATION) * full)
-    return jnp.where(chroma(colours) < LEAST_CHROMA, jnp.inf, jnp.maximum(jnp.maximum(turn / HUE, lack), 0.0))
+    return jnp.where(
+        chroma(colours) < LEAST_CHROMA, jnp.inf, jnp.maximum(jnp.maximum(turn / math.radians(tolerance), lack), 0.0)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class HueDifference:
+    """`hue_difference` with a tolerance of its own, as a `ColourDifference`.
+
+    Attributes:
+      tolerance: largest difference of equal hues [degrees].
+    """
+
+    tolerance: float
+
+    def __call__(self, colours: Array, reference: Array) -> Array:
+        return hue_difference(colours, reference, self.tolerance)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,16 +132,18 @@ class TargetColour:
             )
 
     @classmethod
-    def lit(cls, rgb: tuple[float, float, float] = RED) -> TargetColour:
-        """A detector that does not depend on lighting: the target has the hue of `rgb`, to 15 degrees, and at least 0.7
-        of its saturation; it may be purer, brighter or darker.
+    def lit(cls, rgb: tuple[float, float, float] = RED, tolerance: float = HUE) -> TargetColour:
+        """A detector that does not depend on lighting: the target has the hue of `rgb`, to `tolerance`, and at least
+        0.7 of its saturation; it may be purer, brighter or darker.
 
         Args:
-          rgb: the target's colour in a camera's image, each in 0 to 1.
+          rgb: the target's colour in a camera's image, each in 0 to 1; `rgb_of_hue` makes it from a hue.
+          tolerance: largest difference of equal hues [degrees].
 
         Raises:
-          InputError: a number is outside 0 to 1, or the colour has no hue.
+          InputError: a number is outside its range, or the colour has no hue.
         """
+        check_range("TargetColour: hue_tolerance", tolerance, 1.0, LARGEST_HUE, "degrees")
         if len(rgb) != 3 or not all(0 <= c <= 1 for c in rgb):
             raise InputError(
                 f"TargetColour: color {tuple(rgb)} must be red, green and blue, each from 0 to 1; divide 8-bit values "
@@ -134,11 +155,26 @@ class TargetColour:
                 f"TargetColour: color {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells the "
                 "target from other things; give masks with target_id instead"
             )
-        return cls(rgb, threshold=1.0, difference=hue_difference)
+        return cls(rgb, threshold=1.0, difference=hue_difference if tolerance == HUE else HueDifference(tolerance))
 
     def __call__(self, colours: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
         """Which colours are the target's; a `recogniser.TargetDetector`."""
         return self.difference(colours, jnp.array(self.rgb)) < self.threshold
+
+
+def rgb_of_hue(hue: float, saturation: float) -> tuple[float, float, float]:
+    """The brightest red, green and blue, each in 0 to 1, of a hue and a saturation.
+
+    Args:
+      hue: 0 is red, 120 green, 240 blue [degrees].
+      saturation: from 0 for grey to 1 for a pure colour.
+
+    Raises:
+      InputError: a number is outside its range.
+    """
+    check_range("TargetColour: hue", hue, 0.0, 360.0, "degrees")
+    check_range("TargetColour: saturation", saturation, 0.0, 1.0, "")
+    return colorsys.hsv_to_rgb(hue / 360.0, saturation, 1.0)
 
 
 class Detection(flax.struct.PyTreeNode):

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import OPTIONS, Config, Option
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
-from mechsearch_jax.images.colour import RED, TargetColour
+from mechsearch_jax.images.colour import HUE, RED, TargetColour, rgb_of_hue
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
@@ -72,12 +72,16 @@ class Settings:
         return settings
 
 
-# The key of the target's table that is the workcell's `colour`; all others are of the `Target`.
-COLOR = "color"
+# The keys of the target's table that are the workcell's `colour` and `hue_tolerance`; all others are of the `Target`.
+COLOR, HUE_TOLERANCE = "color", "hue_tolerance"
 
 # The defaults of a file's tables, without the planner's.
 _PARTS: Mapping[str, Any] = {
-    **{field.name: getattr(Workcell(), field.name) for field in dataclasses.fields(Workcell) if field.name != "colour"},
+    **{
+        field.name: getattr(Workcell(), field.name)
+        for field in dataclasses.fields(Workcell)
+        if field.name not in ("colour", "hue_tolerance")
+    },
     "base": Base(),
     "objects": ObjectSizes(),
 }
@@ -89,7 +93,7 @@ def tables() -> dict[str, dict[str, Any]]:
         name: {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
         for name, usual in _PARTS.items()
     }
-    parts["target"][COLOR] = Workcell().colour
+    parts["target"] |= {COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
 
@@ -110,9 +114,7 @@ def load_settings(path: PathLike) -> Settings:
     for key in document.tables[""]:
         begin = ", ".join(f"[{table}]" for table in names)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
-    colour = _colour(document)
-    without_colour = {key: value for key, value in document.tables.get("target", {}).items() if key != COLOR}
-    document = dataclasses.replace(document, tables={**document.tables, "target": without_colour})
+    detector, document = _detector(document)
     base = with_table(document, "base", Base())
     x, y, z = base.position
     document = _with_moved_place(document, (-x, -y, -z))
@@ -127,7 +129,7 @@ def load_settings(path: PathLike) -> Settings:
         document,
         "target",
         {"inset": target.inset},
-        lambda given: Workcell(target=target if given else Target(), colour=colour, **parts),
+        lambda given: Workcell(target=target if given else Target(), **detector, **parts),
     )
     return _with_planner(document, Settings(workcell, objects))
 
@@ -148,15 +150,33 @@ def _with_moved_place(document: Document, offset: tuple[float, float, float]) ->
     return dataclasses.replace(document, tables={**document.tables, "arm": {**arm, "place": moved}})
 
 
-def _colour(document: Document) -> tuple[float, float, float]:
-    """The target's colour."""
+def _detector(document: Document) -> tuple[dict[str, Any], Document]:
+    """What the workcell holds of the target's colour, and the document without it."""
     table = document.tables.get("target", {})
     if "colour" in table:
         raise InputError(f"{document.where('target', 'colour')} is unknown; did you mean {COLOR}?")
-    if COLOR not in table:
-        return Workcell().colour
-    given = checked(table[COLOR], tuple[float, float, float], document.where("target", COLOR))
-    return apply(document, "target", {COLOR: given}, lambda values: TargetColour.lit(values.get(COLOR, RED))).rgb
+    given: dict[str, Any] = {}
+    if COLOR in table:
+        given[COLOR] = _rgb(document, table[COLOR])
+    if HUE_TOLERANCE in table:
+        given[HUE_TOLERANCE] = checked(table[HUE_TOLERANCE], float, document.where("target", HUE_TOLERANCE))
+    lit = lambda values: TargetColour.lit(values.get(COLOR, RED), values.get(HUE_TOLERANCE, HUE))  # noqa: E731
+    apply(document, "target", given, lit)
+    names = {COLOR: "colour", HUE_TOLERANCE: "hue_tolerance"}
+    rest = {key: value for key, value in table.items() if key not in names}
+    without = dataclasses.replace(document, tables={**document.tables, "target": rest})
+    return {names[key]: value for key, value in given.items()}, without
+
+
+def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
+    """The target's colour, given as red, green and blue, or as a table of hue and saturation."""
+    where = document.where("target", COLOR)
+    if not isinstance(value, dict):
+        return checked(value, tuple[float, float, float], where)
+    if value.keys() != {"hue", "saturation"}:
+        raise InputError(f"{where} must be red, green and blue, or {{hue = DEGREES, saturation = SHARE}}")
+    hue, saturation = (checked(value[name], float, f"{where} {name}") for name in ("hue", "saturation"))
+    return apply(document, "target", {COLOR: (hue, saturation)}, lambda numbers: rgb_of_hue(*numbers[COLOR]))
 
 
 def _target(document: Document) -> Target:

@@ -7,7 +7,7 @@ from typing import Any
 
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.config.config import ProblemConfig
-from mechsearch_jax.images.colour import RED, TargetColour
+from mechsearch_jax.images.colour import HUE, RED, TargetColour
 from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
@@ -27,8 +27,9 @@ class Workcell:
       target: what is searched; for a scenario, which has its own target, how finely it is searched.
       arm: home and speed, and where it puts the target.
       calibration: how far the shelf in an image may be from its place; decisions do not depend on it.
-      colour: of the target in colour images: red, green and blue in 0 to 1. Compiled programs do not depend on it.
+      colour: of the target in colour images: red, green and blue in 0 to 1. The planner's programs do not depend on it.
       hand: how the real hand is used.
+      hue_tolerance: by how much hues may differ from the target's and count as equal [degrees].
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -41,9 +42,11 @@ class Workcell:
     colour: tuple[float, float, float] = RED
     # Searches are saved with a digest of this text, and may go on with another hand.
     hand: HandConfig = dataclasses.field(default_factory=HandConfig, repr=False)
+    # Not in the representation, so that searches that were saved before it existed go on.
+    hue_tolerance: float = dataclasses.field(default=HUE, repr=False)
 
     def __post_init__(self):
-        TargetColour.lit(self.colour)
+        TargetColour.lit(self.colour, self.hue_tolerance)
         room = min(self.shelf.back - self.shelf.front, self.shelf.left - self.shelf.right)
         if not 2 * self.target.inset < room:
             raise InputError(
@@ -61,7 +64,7 @@ class Workcell:
     @property
     def detector(self) -> TargetColour:
         """A `detector` of a `Recogniser`, which finds the target's pixels by their colour."""
-        return TargetColour.lit(self.colour)
+        return TargetColour.lit(self.colour, self.hue_tolerance)
 
     def is_cached(self, target: Target, config: ProblemConfig) -> bool:
         """Whether the problem of a target was built before and is on disk."""
