@@ -10,8 +10,10 @@ import pytest
 from stage import HIDDEN, OPEN, Stage, grab
 
 from mechsearch_jax.actions import KINDS, ActionKind
+from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
 from mechsearch_jax.envs.camera.sensing import OtherNoise, sensing_of, true_camera
+from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
@@ -184,6 +186,24 @@ def test_depth_noise_and_missing_depth_are_as_given():
     np.testing.assert_allclose(lost[there & ~missing], usual[there & ~missing], atol=1e-6)
 
 
+def test_exposure_and_noise_of_colour_are_as_given():
+    full, view = recogniser("full", target_of(SCENE)), shelf_view(CAMERA, SHELF)
+    world = from_scenario(SCENE)
+    appearance = drawn_appearance(scene_key(world), full.detector.rgb, 40.0)
+    plain = np.asarray(observe(view.camera, world, SHELF, appearance).colour)
+    for mismatch in (Mismatch(exposure=0.5), Mismatch(exposure=1.5, color_noise=8 / 255, white_balance=0.1)):
+        seen = np.asarray(sensed_colour(jax.random.key(1), plain, sensed(mismatch).colour))
+        assert seen.min() >= 0.0
+        assert seen.max() <= 1.0
+        np.testing.assert_allclose(255 * seen, np.round(255 * seen), atol=1e-4)
+        balance = 1.0 + mismatch.white_balance * np.array([1.0, 0.0, -1.0])
+        expected = mismatch.exposure * balance * plain
+        inside = (expected > 0.2) & (expected < 0.8)
+        error = (seen - expected)[inside]
+        assert np.mean(error) == pytest.approx(0.0, abs=2e-4)
+        assert np.std(error) == pytest.approx(mismatch.color_noise, rel=0.03)
+
+
 def test_whether_a_pixel_is_lost_does_not_depend_on_its_noise():
     camera, depth = dataclasses.replace(CAMERA, width=300, height=300), jnp.full((300, 300), 0.7)
     measured = OtherNoise(np.float32(0.001), np.float32(0.3))(jax.random.key(0), camera, depth)
@@ -209,11 +229,23 @@ def test_what_cannot_be_simulated_is_refused():
     Method(mismatch=Mismatch(physics="fine-step")).check()
     numbers = Mismatch(friction=2.0, mass=2.0, shelf_shift=0.01, shelf_turn=1.0, camera_shift=0.01)
     Method(engine="MjxSimulator", mismatch=numbers).check()
+    for colours in (
+        Mismatch(color_noise=0.0),
+        Mismatch(exposure=0.5),
+        Mismatch(white_balance=0.1),
+        Mismatch(hue_gap=0),
+    ):
+        for recognition in ("oracle", "informed", "masks"):
+            with pytest.raises(InputError, match="add --recognition full"):
+                Method(recognition=recognition, mismatch=colours).check()
+        Method(recognition="full", mismatch=colours).check()
+    with pytest.raises(InputError, match="exposure"):
+        Mismatch(exposure=0.0)
 
 
 @pytest.mark.parametrize("eyes", [oracle, informed])
 def test_recognisers_without_an_image_refuse_other_depth(eyes):
-    for mismatch in (Mismatch(depth_noise=0.002), Mismatch(missing_depth=0.1, camera_shift=0.01)):
+    for mismatch in (Mismatch(depth_noise=0.002), Mismatch(missing_depth=0.1, camera_shift=0.01), Mismatch(exposure=2)):
         with pytest.raises(InputError, match="need an image"):
             eyes(jax.random.key(0), snapshot(mismatch))
 
@@ -234,7 +266,8 @@ def test_what_is_data_compiles_nothing():
     assert mould(friction=0.5) == mould(friction=2.0, mass=2.0, physics="fine-step") == mould()
     assert mould(camera_shift=0.01) == mould(camera_turn=2.0, friction=2.0) == mould(shelf_shift=0.01)
     assert mould(depth_noise=0.002) == mould(missing_depth=0.1)
-    assert len({mould(), mould(camera_shift=0.01), mould(depth_noise=0.002)}) == 3
+    assert mould(exposure=0.5) == mould(color_noise=0.0, hue_gap=0.0, white_balance=0.1)
+    assert len({mould(), mould(camera_shift=0.01), mould(depth_noise=0.002), mould(exposure=0.5)}) == 4
 
 
 def test_every_world_of_a_simulator_has_its_own_cell():

@@ -1,5 +1,6 @@
 """The planner's eyes: what recognisers make of the simulated world."""
 
+import colorsys
 import dataclasses
 
 import jax
@@ -7,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.camera.recognisers import labelled, large_segments, numbered, recogniser, true_labels
-from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
+from mechsearch_jax.envs.camera.recognisers import detected, large_segments, numbered, recogniser, true_labels
+from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
-from mechsearch_jax.images.cloud import shelf_view
+from mechsearch_jax.images.cloud import shelf_view, thinned_view
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import measured_depth
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
@@ -20,6 +22,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA, SHELF = Camera(), Shelf()
@@ -132,36 +135,80 @@ class Curious:
 
 @pytest.fixture(scope="module")
 def shown():
-    """What `full` sees of a world, but for its segments."""
+    """What `full` sees of a world, but for its segments, and what the pixels truly show."""
     curious = dataclasses.replace(recogniser("full", target_of(SCENE)), labeller=Curious())
+    view = thinned_view(CAMERA, SHELF)
 
     def see(world):
-        view, snapshot = shelf_view(CAMERA, SHELF), Snapshot(CAMERA, SHELF, world)
         keys = jax.random.split(jax.random.key(0))
-        image = labelled(keys, curious, view, SHELF, world, snapshot.target_seen, 0.0)
+        image, seen = detected(keys, curious, view, SHELF, world, found_pixels(CAMERA) / view.stride**2)
         owner = np.asarray(observe(view.camera, world, SHELF).segmentation)
-        return jax.tree.map(np.asarray, image), owner, bool(snapshot.target_seen)
+        return jax.tree.map(np.asarray, image), owner, bool(seen)
 
     return see
 
 
-@pytest.mark.parametrize(("y", "seen"), [(-0.0335, False), (-0.0403, True)])
-def test_full_is_given_the_targets_pixels_only_where_the_detector_sees_it(world, shown, y, seen):
+@pytest.mark.parametrize(("y", "in_sight"), [(0.0, False), (-0.048, True)])
+def test_full_finds_the_target_in_colour_where_it_is_in_sight(world, shown, y, in_sight):
     x, _, z = SCENE.target.position
-    image, owner, labelled = shown(moved(world, TARGET, [x, y, z]))
-    assert labelled == seen
-    assert (owner == TARGET).sum() > 5
-    np.testing.assert_array_equal(image.labels == 8, (owner == TARGET) & seen)
-    assert image.of_target.any() == seen
+    image, owner, seen = shown(moved(world, TARGET, [x, y, z]))
+    assert seen == in_sight
+    assert image.of_target.any() == in_sight
+    true = owner == TARGET
+    assert np.sum(true) > 100 or not in_sight
+    if in_sight:
+        named = image.labels == 8
+        assert np.sum(named & true) > 0.95 * np.sum(true)
+        assert np.sum(named & ~true) < 0.05 * np.sum(true)
 
 
-def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(world, shown, masks):
+def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(world, shown):
     image, owner, _ = shown(world)
     nothing = owner == -1
     assert nothing.sum() > 1000
     assert np.isnan(image.depth[nothing]).all()
     assert np.isfinite(image.depth[~nothing]).all()
-    assert masks.depth is measured_depth
+
+
+def test_full_asks_the_truth_for_nothing(world):
+    """Not even a snapshot whose truth cannot be asked differs."""
+
+    class Blind(Snapshot):
+        @property
+        def target_seen(self):
+            raise AssertionError("full asked whether the target is in sight")
+
+        @property
+        def target_pose(self):
+            raise AssertionError("full asked where the target is")
+
+    full, masks = recogniser("full", target_of(SCENE)), recogniser("masks", target_of(SCENE))
+    jax.eval_shape(lambda here: full(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
+    with pytest.raises(AssertionError, match="in sight"):
+        jax.eval_shape(lambda here: masks(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
+
+
+def test_colours_belong_to_the_scene_and_keep_away_from_the_targets(world):
+    key = scene_key(world)
+    assert (jax.random.key_data(key) == jax.random.key_data(scene_key(moved(world, 0, [0.5, 0.1, 0.5])))).all()
+    taller = world.replace(half_size=world.half_size.at[0, 2].add(0.001))
+    assert (jax.random.key_data(key) != jax.random.key_data(scene_key(taller))).any()
+    target = (0.1, 0.3, 0.8)
+    middle = colorsys.rgb_to_hsv(*target)[0]
+    least = {}
+    for gap in (0.0, 40.0, 120.0):
+        apart = []
+        for seed in range(20):
+            colours = np.asarray(drawn_appearance(jax.random.key(seed), target, gap).colours)
+            assert colours.shape == PALETTE.shape
+            assert colours.min() >= 0.0
+            assert colours.max() <= 1.0
+            np.testing.assert_allclose(colours[TARGET], target, rtol=1e-6)
+            hues = np.array([colorsys.rgb_to_hsv(*rgb)[0] for rgb in colours[:TARGET]])
+            apart += list(180 - np.abs(np.mod(360 * np.abs(hues - middle), 360) - 180))
+        least[gap] = min(apart)
+        assert min(apart) > gap - 0.1
+    assert least[0.0] < 10
 
 
 def test_depth_is_infinite_where_nothing_is_and_nan_where_nothing_was_measured():

@@ -134,10 +134,12 @@ def _seen_objects(snapshot: Snapshot) -> Superquadrics:
     """The true objects on the board, where they seem to be to the planner.
 
     Raises:
-      InputError: the depth is measured otherwise, which without an image would change nothing.
+      InputError: depth or colour are measured otherwise, which without an image would change nothing.
     """
     if snapshot.sensing is not None and snapshot.sensing.noise is not None:
         raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
+    if snapshot.sensing is not None and snapshot.sensing.colour is not None:
+        raise InputError("color_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
     return as_seen(objects_on_the_board(snapshot), snapshot.sensing)
 
 
