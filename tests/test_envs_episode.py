@@ -90,6 +90,27 @@ def test_an_informed_planner_has_found_a_hidden_target_before_the_first_action(p
     assert blocked.failure == "found, but not graspable"
 
 
+@dataclasses.dataclass(frozen=True)
+class Hasty:
+    """A recogniser that detects the target by itself, and takes it for visible wherever it is."""
+
+    detects_target: bool = True
+
+    def __call__(self, key, snapshot):
+        return informed(key, snapshot)
+
+
+def test_a_detected_target_counts_as_found_once_it_is_truly_in_sight(problem):
+    episode = run(problem, HIDDEN, Stage(reveal), recogniser=Hasty())
+    assert (episode.found_step, episode.graspable_step, episode.retrieved) == (1, 1, True)
+    first, second = episode.steps
+    assert (first.found, first.graspable, second.found, second.graspable) == (False, False, True, True)
+    # The planner goes by what it takes for the target.
+    assert first.belief_size == 1
+    blind = run(problem, HIDDEN, Stage(), recogniser=Hasty())
+    assert (blind.found_step, blind.failure) == (None, "not found")
+
+
 @pytest.mark.parametrize("policy", ["grab", "search-for-grasp"])
 def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     diary = Diary()
