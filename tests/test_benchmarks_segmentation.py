@@ -12,7 +12,6 @@ from rich.console import Console
 from mechsearch_jax.benchmarks.parts import images, segmentation
 from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps
 from mechsearch_jax.benchmarks.report import console_tables
-from mechsearch_jax.envs.camera.recognisers import true_masks
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.drawing import save_figure

@@ -131,8 +131,8 @@ def test_a_shift_moves_what_the_oracle_sees_by_as_much(eyes, name):
 @pytest.mark.parametrize("mismatch", [Mismatch(camera_turn=2.0, camera_shift=0.02), Mismatch(shelf_turn=2.0)])
 def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
     masks = dataclasses.replace(recogniser("masks", target_of(SCENE)), noise=no_noise)
-    shot, keys = snapshot(mismatch), jax.random.split(jax.random.key(0))
-    image = labelled(keys, masks, shelf_view(CAMERA, SHELF), SHELF, shot.world, jnp.array(False), 0.0, shot.sensing)
+    shot, key = snapshot(mismatch), jax.random.key(0)
+    image = labelled(key, masks, shelf_view(CAMERA, SHELF), SHELF, shot.world, jnp.array(False), shot.sensing)
     points, labels = np.asarray(image.points), np.asarray(image.labels)
     seen, there = oracle(jax.random.key(0), shot).objects, snapshot().world
     for slot in np.flatnonzero(seen.valid):
@@ -168,11 +168,11 @@ def test_a_camera_that_is_shifted_shifts_recognised_poses():
 
 def test_depth_noise_and_missing_depth_are_as_given():
     masks, view = recogniser("masks", target_of(SCENE)), shelf_view(CAMERA, SHELF)
-    keys = jax.random.split(jax.random.key(0))
+    key = jax.random.key(0)
 
     def points(mismatch):
         shot = snapshot(mismatch)
-        return np.asarray(labelled(keys, masks, view, SHELF, shot.world, jnp.array(False), 0.0, shot.sensing).points)
+        return np.asarray(labelled(key, masks, view, SHELF, shot.world, jnp.array(False), shot.sensing).points)
 
     usual, exact, noisy = points(ASSUMED), points(Mismatch(depth_noise=0.0)), points(Mismatch(depth_noise=0.005))
     lost = points(Mismatch(missing_depth=0.2))

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mechsearch_jax.benchmarks.parts.segmentation import numbered
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
-from mechsearch_jax.envs.camera.recognisers import detected, large_segments, numbered, recogniser, true_labels
+from mechsearch_jax.envs.camera.recognisers import detected, large_segments, recogniser, true_labels
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.episodes import target_of
@@ -125,9 +126,9 @@ def test_what_may_be_the_target_is_no_segment():
 
 @dataclasses.dataclass
 class Curious:
-    """A labeller that takes the target's pixels for the ninth instance, and all else for the shelf."""
+    """A segmenter that takes the target's pixels for the ninth instance, and all else for the shelf."""
 
-    def __call__(self, key, shelf, points, of_target, masks, unseen):
+    def __call__(self, key, shelf, points, of_target):
         return jnp.where(of_target, 8, FREE).astype(jnp.int8)
 
     __hash__ = object.__hash__
@@ -136,7 +137,7 @@ class Curious:
 @pytest.fixture(scope="module")
 def shown():
     """What `full` sees of a world, but for its segments, and what the pixels truly show."""
-    curious = dataclasses.replace(recogniser("full", target_of(SCENE)), labeller=Curious())
+    curious = dataclasses.replace(recogniser("full", target_of(SCENE)), segmenter=Curious())
     view = thinned_view(CAMERA, SHELF)
 
     def see(world):

@@ -11,24 +11,80 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
 from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks.parts.images import Look, Scene, check_images, image_of, image_settings
-from mechsearch_jax.envs.camera.recognisers import Labeller, Segmenter
 from mechsearch_jax.envs.camera.simulated_camera import is_found
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.images.cloud import shelf_view
-from mechsearch_jax.networks.weights import shipped_weights
+from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.perception.assignment import assign
+from mechsearch_jax.perception.segmentation import NetworkSegmenter
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+
+
+class Labeller(Protocol):
+    """Says which pixels show which object."""
+
+    def __call__(
+        self,
+        key: Key[Array, ""],
+        shelf: Shelf,
+        points: Float[Array, "h w 3"],
+        of_target: Bool[Array, "h w"],
+        masks: Int[Array, "h w"],
+    ) -> Int[Array, "h w"]:
+        """Label an image.
+
+        Args:
+          key: PRNG key.
+          shelf: may be traced.
+          points: in the world [m]; NaN where nothing was measured.
+          of_target: the target's pixels.
+          masks: the true labels, whose numbers the labels have.
+        """
+        ...
+
+
+def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
+    """The `Labeller` that returns the true labels."""
+    return masks
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NamedSegments:
+    """The `Labeller` that segments the image with a network, and numbers the segments after the true objects.
+
+    Attributes:
+      weights: of the segmentation network.
+    """
+
+    weights: Weights
+
+    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
+        return numbered(NetworkSegmenter.of(self.weights)(key, shelf, points, of_target), masks)
+
+
+def numbered(segments: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
+    """Segments, numbered 0 to 7, renumbered one to one after the true objects that they overlap most; none is lost."""
+    slots = jnp.arange(TARGET)
+    segmented = (segments.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
+    truth = (masks.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
+    # A segment without overlap still gets the slot of an object that no segment matches.
+    name = assign(-jnp.matmul(segmented.T, truth))
+    return jnp.where(segments >= 0, name[jnp.maximum(segments, 0)], segments).astype(jnp.int8)
+
 
 # Colours of up to eight objects, distinguishable with red-green blindness.
 _COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#8c8c8c")
@@ -158,13 +214,12 @@ class Bench:
         return [self._label(label, index, noise)[:2] for index, noise in choice]
 
     def _compiled(self) -> Callable[..., Any]:
-        labeller = self.labeller or Segmenter(shipped_weights("segmentation"))
+        labeller = self.labeller or NamedSegments(shipped_weights("segmentation"))
 
         def label(key, image, target_seen):
             labels = image.shown.labels
             of_target = (labels == TARGET) & target_seen
-            # Small segments are scored, too.
-            return labeller(key, self.shelf, image.shown.points, of_target, labels, 0.0)
+            return labeller(key, self.shelf, image.shown.points, of_target, labels)
 
         return jax.jit(label)
 

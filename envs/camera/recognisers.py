@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Literal, Protocol, get_args
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -33,10 +33,9 @@ from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
-from mechsearch_jax.perception.segmentation import NetworkSegmenter
+from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.detector import found_pixels
@@ -67,67 +66,6 @@ def true_labels(
     return jnp.where(jnp.isfinite(points).all(axis=-1), labels, MISSING).astype(jnp.int8)
 
 
-class Labeller(Protocol):
-    """Says which pixels show which object."""
-
-    def __call__(
-        self,
-        key: Key[Array, ""],
-        shelf: Shelf,
-        points: Float[Array, "h w 3"],
-        of_target: Bool[Array, "h w"],
-        masks: Int[Array, "h w"],
-        unseen: float,
-    ) -> Int[Array, "h w"]:
-        """Label an image.
-
-        Args:
-          key: PRNG key.
-          shelf: may be traced.
-          points: in the world [m]; NaN where nothing was measured.
-          of_target: where the detector sees the target; False everywhere until it does.
-          masks: the true labels; a labeller that must not use them takes only the objects' numbers from them, so that
-            the effect of an action on an object can be judged.
-          unseen: a target of at most this many pixels is not detected.
-        """
-        ...
-
-
-def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array, unseen: float) -> Array:
-    """The `Labeller` that returns the true labels."""
-    return masks
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Segmenter:
-    """The `Labeller` that segments the image with a network, and names the segments after the true objects.
-
-    Segments small enough to be an undetected target become OTHER: as objects they would rule out the target's own pose.
-
-    Attributes:
-      weights: of the segmentation network.
-    """
-
-    weights: Weights
-
-    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array, unseen: float) -> Array:
-        segments = NetworkSegmenter.of(self.weights)(key, shelf, points, of_target)
-        return numbered(large_segments(segments, SAMPLED * unseen), masks)
-
-
-def numbered(segments: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """Segments, numbered 0 to 7, renumbered one to one after the true objects that they overlap most; none is lost.
-
-    The planner does not depend on the numbers, but the simulator's check whether a picked object slipped does.
-    """
-    slots = jnp.arange(TARGET)
-    segmented = (segments.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
-    truth = (masks.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
-    # A segment without overlap still gets the slot of an object that no segment matches.
-    name = assign(-jnp.matmul(segmented.T, truth))
-    return jnp.where(segments >= 0, name[jnp.maximum(segments, 0)], segments).astype(jnp.int8)
-
-
 def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:
     """Labels with segments, numbered from 0, of at most `pixels` pixels set to OTHER."""
     small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
@@ -142,14 +80,12 @@ class ImageRecogniser:
 
     Attributes:
       target: its shape.
-      labeller: says which pixels show which object.
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
     """
 
     target: Target
-    labeller: Labeller
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
@@ -157,45 +93,55 @@ class ImageRecogniser:
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
-        unseen = found_pixels(snapshot.camera) / view.stride**2
-        image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen, unseen, snapshot.sensing)
+        image = labelled(keys[0], self, view, shelf, snapshot.world, snapshot.target_seen, snapshot.sensing)
         shapes = ShapeNetwork.of(self.weights)
         # Compiled on its own, whatever the labels come from.
         objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
         return Observation(objects, snapshot.target_seen, pose)
 
 
-@kept(static_argnames=("recogniser", "unseen"))
+@kept(static_argnames=("recogniser",))
 def labelled(
-    keys: Key[Array, "2"],
+    key: Key[Array, ""],
     recogniser: ImageRecogniser,
     view: View,
     shelf: Shelf,
     world: World,
     target_seen: Bool[Array, ""],
-    unseen: float,
     sensing: Sensing | None = None,
 ) -> LabelledImage:
     """The labelled image that a recogniser fits shapes to: the part that shows the shelf, as measured.
 
     Args:
-      keys: of the noise, and of the labeller.
+      key: of the noise.
       recogniser: static.
       view: which rays of a camera are cast.
       shelf: the shelf in the image.
       world: the true state.
       target_seen: whether the detector sees the target; if not, the image marks no pixels as the target's.
-      unseen: a target of at most this many pixels of the view is not detected; static.
       sensing: see `Snapshot`; the points lie where they seem to be to the planner.
     """
     image = observe(true_camera(view.camera, sensing), world, shelf)
     noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
-    points = noise(keys[0], view.camera, image.depth)
+    points = noise(key, view.camera, image.depth)
     masks = true_labels(points, image.segmentation, shelf)
-    labels = recogniser.labeller(keys[1], shelf, points, (image.segmentation == TARGET) & target_seen, masks, unseen)
     # Where the true image shows nothing is marked, as in true masks.
     depth = measured_depth(view.camera, image.depth, points)
-    return LabelledImage(points, depth, labels, (masks == TARGET) & target_seen)
+    return LabelledImage(points, depth, masks, (masks == TARGET) & target_seen)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WeightedSegmenter:
+    """The `NetworkSegmenter` of some weights, as a static value.
+
+    Attributes:
+      weights: of the segmentation network.
+    """
+
+    weights: Weights
+
+    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
+        return NetworkSegmenter.of(self.weights)(key, shelf, points, of_target)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -208,17 +154,17 @@ class ColourRecogniser:
     Attributes:
       target: its shape.
       detector: finds the target's colour, which is the target's true one.
-      labeller: says which pixels show which object.
+      segmenter: says which pixels show which object.
       weights: of the recognition network.
       noise: of the depth sensor.
       camera: of colours, where `Snapshot.sensing` says nothing.
       refinement: how recognised shapes are refined.
-      detects_target: see `snapshot.truly_in_sight`.
+      detects_target: see `snapshot.Truth`.
     """
 
     target: Target
     detector: TargetColour
-    labeller: Labeller
+    segmenter: Segmenter
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     camera: ColourSensing = dataclasses.field(default_factory=ColourSensing)
@@ -285,14 +231,15 @@ def detected(
     """The labelled image that a recogniser fits shapes to, and whether it shows the target.
 
     Args:
-      keys: of the noise, and of the labeller.
+      keys: of the noise, and of the segmenter.
       recogniser: static.
       view, shelf, world, sensing: see `labelled`.
       unseen: a target of at most this many pixels of the view is not detected; static.
     """
-    image, points, depth, detection = sighted(keys[0], recogniser, view, shelf, world, unseen, sensing)
-    numbers = true_labels(points, image.segmentation, shelf)
-    labels = recogniser.labeller(keys[1], shelf, points, detection.pixels, numbers, unseen)
+    _, points, depth, detection = sighted(keys[0], recogniser, view, shelf, world, unseen, sensing)
+    # As objects, small segments would rule out the pose of a target that is not detected.
+    segments = recogniser.segmenter(keys[1], shelf, points, detection.pixels)
+    labels = large_segments(segments, SAMPLED * unseen)
     of_target = detection.pixels & above_board(shelf, points) & detection.visible
     return LabelledImage(points, depth, labels, of_target), detection.visible
 
@@ -317,10 +264,10 @@ def recogniser(name: str, target: Target, detector: TargetColour | None = None) 
 
 @functools.cache
 def _with_masks(target: Target) -> ImageRecogniser:
-    return ImageRecogniser(target, true_masks, shipped_weights("recognition"))
+    return ImageRecogniser(target, shipped_weights("recognition"))
 
 
 @functools.cache
 def _alone(target: Target, detector: TargetColour) -> ColourRecogniser:
-    segmenter = Segmenter(shipped_weights("segmentation"))
+    segmenter = WeightedSegmenter(shipped_weights("segmentation"))
     return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"))

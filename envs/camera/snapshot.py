@@ -7,6 +7,7 @@ import functools
 from typing import Protocol, runtime_checkable
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -16,10 +17,14 @@ from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+
+# Distance that stands for all larger ones, between what is recognised and what is there [m].
+FARTHEST = 10.0
 
 
 class Sight(flax.struct.PyTreeNode):
@@ -100,17 +105,38 @@ class Recogniser(Protocol):
 
 @runtime_checkable
 class Detects(Protocol):
-    """A recogniser that may take the target for visible where it is not, or not for visible where it is."""
+    """A recogniser that sees images alone: it may take the target for visible where it is not, or not where it is, and
+    numbers objects as it likes."""
 
     @property
     def detects_target(self) -> bool: ...
 
 
-def truly_in_sight(recogniser: Recogniser, snapshot: Snapshot) -> Bool[Array, ""]:
-    """Whether a target that the planner takes as found counts as found: where a recogniser detects it by itself, the
-    image must truly show enough of it; others are told, and it always counts."""
-    detects = isinstance(recogniser, Detects) and recogniser.detects_target
-    return snapshot.target_seen if detects else jnp.array(True)
+class Truth(flax.struct.PyTreeNode):
+    """What a look truly shows, for verdicts and records; the planner does not know it.
+
+    Attributes:
+      shown: whether the target is truly in sight, or the recogniser knows it from the truth anyway.
+      bodies: the number of the body that each recognised object stands for, each body once, int32, shape (8,).
+    """
+
+    shown: jax.Array
+    bodies: jax.Array
+
+
+def truth_of(recogniser: Recogniser, snapshot: Snapshot, observation: Observation) -> Truth:
+    """The truth of a look, at which a recogniser made an observation.
+
+    The recognisers that know the truth have its numbers. Of the others the bodies are those whose centres are nearest.
+    """
+    numbers = jnp.arange(TARGET, dtype=jnp.int32)
+    if not (isinstance(recogniser, Detects) and recogniser.detects_target):
+        return Truth(jnp.array(True), numbers)
+    scene, seen = true_superquadrics(as_seen(snapshot.world, snapshot.sensing)), observation.objects
+    apart = jnp.linalg.norm(seen.position[:, None] - scene.position[None], axis=-1)
+    # An object that is none, and a body that is none, are for each other: they take what the others leave.
+    both = seen.valid[:, None] & scene.valid[None]
+    return Truth(snapshot.target_seen, assign(jnp.where(both, jnp.minimum(apart, FARTHEST), FARTHEST)))
 
 
 def oracle(key: Array, snapshot: Snapshot) -> Observation:

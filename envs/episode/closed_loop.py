@@ -20,6 +20,7 @@ from mechsearch_jax.envs.episode.episode_log import (
     distrust,
     overflow_trouble,
     record,
+    renumbered,
     result_of,
     takes_target,
     target_trouble,
@@ -150,6 +151,8 @@ class EpisodePool:
         self._clock = StageClock(count, listeners.stage, compiling)
         # What is being done in the slots that wait for the end of it.
         self._moving: dict[int, Choice] = {}
+        # The bodies that the recognised objects of every slot stand for; `Slots` number objects, the simulator bodies.
+        self._bodies: Int[np.ndarray, "slots 8"] = np.zeros((count, 0), np.int32)
         key = jax.random.key_data(jax.random.key(0))
         self._keys: UInt[np.ndarray, "slots 2 *words"] = np.zeros((count, 2, *key.shape), key.dtype)
 
@@ -192,7 +195,12 @@ class EpisodePool:
         deciding = [r for r in logs if r not in trouble and (found[r] or not logs[r].last)]
         with clock("plan", deciding):
             choices = self._planner.decide(planner_keys, deciding)
-        choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
+        self._bodies = knowledge.bodies
+        choices = {
+            r: renumbered(choice, self._bodies[r])
+            for r, choice in choices.items()
+            if not logs[r].last or takes_target(choice)
+        }
         with clock("judge", to_judge):
             verdicts = self._settings.protocol.judge(self._planner, world, to_judge)
 
@@ -227,7 +235,8 @@ class EpisodePool:
             if acting or self._moving:
                 executed = self._executed({r: choices[r] for r in acting})
                 others = {r: choice for r, choice in executed.choices.items() if choice is not choices.get(r, choice)}
-                self._planner.took({r: choice.action for r, choice in others.items()})
+                taken = {r: renumbered(choice, np.argsort(self._bodies[r])) for r, choice in others.items()}
+                self._planner.took({r: choice.action for r, choice in taken.items()})
                 for r, choice in others.items():
                     decided[r].log.took(choice)
 

@@ -9,7 +9,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of
 from mechsearch_jax.envs.episode.records import Episode, Step, record_action
@@ -47,6 +47,20 @@ def chosen(decision: Decision) -> Choice:
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
     others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
     return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused, others)
+
+
+def renumbered(choice: Choice, numbers: Int[np.ndarray, " objects"]) -> Choice:
+    """A choice whose actions name object i by `numbers[i]`; the same choice if that is i for all."""
+    if np.array_equal(numbers, np.arange(len(numbers))):
+        return choice
+
+    def renamed(action: Action) -> Action:
+        index = np.asarray(action.object)
+        moved = np.isin(index, np.arange(len(numbers)))
+        return action.replace(object=np.where(moved, numbers[np.where(moved, index, 0)], index).astype(index.dtype))
+
+    others = None if choice.others is None else renamed(choice.others)
+    return choice.replace(action=renamed(choice.action), others=others)
 
 
 def takes_target(choice: Choice) -> bool:

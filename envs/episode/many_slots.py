@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Int
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.belief.belief import without_grasps
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, sight_of, truly_in_sight
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.episode.slots import BeliefSummary, sizes_and_truths, summary, swept_free_of
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
-from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, scenes_of
@@ -55,12 +55,12 @@ ANYTHING = Question("__call__")
 
 
 class PlannerState(flax.struct.PyTreeNode):
-    """What the planner knows in every slot, and `BeliefSummary.shown`; fields have a leading axis for the slots."""
+    """What the planner knows in every slot, and the truth of its looks; fields have a leading axis for the slots."""
 
     belief: Belief
     observation: Observation
     action: Action
-    shown: jax.Array
+    truth: Truth
 
 
 class ManySlots:
@@ -102,7 +102,8 @@ class ManySlots:
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), shapes
         )
-        empty = PlannerState(initial_belief(problem), seen, no_action(), jnp.array(False))
+        unseen = Truth(jnp.array(False), jnp.arange(TARGET, dtype=jnp.int32))
+        empty = PlannerState(initial_belief(problem), seen, no_action(), unseen)
         self._state: PlannerState = jax.tree.map(
             lambda a: jax.device_put(np.zeros((self._count, *a.shape), a.dtype)), empty
         )
@@ -173,7 +174,7 @@ class ManySlots:
             self._state = _look(
                 self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
             )
-        return summary(self._problem, self._state.belief, in_base(world, self._sensing), self._state.shown)
+        return summary(self._problem, self._state.belief, in_base(world, self._sensing), self._state.truth)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`.
@@ -286,7 +287,7 @@ def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"])
         (initial_belief(problem), no_action()),
         (state.belief, state.action),
     )
-    return state.replace(belief=belief, action=action, shown=state.shown & ~fresh)
+    return state.replace(belief=belief, action=action, truth=state.truth.replace(shown=state.truth.shown & ~fresh))
 
 
 @kept()
@@ -312,7 +313,9 @@ def _look(
         snapshot = Snapshot(problem.camera, problem.shelf, here, sight, sensed)
         observation = recogniser(key, snapshot)
         belief = update_belief(problem, slot_state.belief, observation, slot_state.observation, slot_state.action)
-        return PlannerState(belief, observation, no_action(), slot_state.shown | truly_in_sight(recogniser, snapshot))
+        truth = truth_of(recogniser, snapshot, observation)
+        truth = truth.replace(shown=truth.shown | slot_state.truth.shown)
+        return PlannerState(belief, observation, no_action(), truth)
 
     new = jax.vmap(look)(
         _rows_of(state, rows), _some_worlds(world, rows), _rows_of(keys, rows), _rows_of(sensing, rows)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, true_target_pose, truly_in_sight
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, Truth, true_target_pose, truth_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge, swept_free
 from mechsearch_jax.envs.world.world import World
@@ -38,7 +38,8 @@ class BeliefSummary:
       size: number of candidate poses where it can be.
       truth: whether it can be at the candidate pose nearest to its true pose.
       restarts: how often f was started anew.
-      shown: whether a target that is found was truly in sight at some look; see `snapshot.truly_in_sight`.
+      shown: whether a target that is found was truly in sight at some look; see `snapshot.Truth`.
+      bodies: of the last look, see `snapshot.Truth`; shape (S, 8).
     """
 
     found: Bool[np.ndarray, " slots"]
@@ -46,6 +47,7 @@ class BeliefSummary:
     truth: Bool[np.ndarray, " slots"]
     restarts: Int[np.ndarray, " slots"]
     shown: Bool[np.ndarray, " slots"]
+    bodies: Int[np.ndarray, "slots 8"]
 
 
 class Slots(Protocol):
@@ -107,7 +109,7 @@ class OneSlot:
       belief: about the target.
       decision: of the policy; None between a look and its decision.
       action: the decision's, to be executed before the next look; of kind NONE before the first.
-      shown: see `BeliefSummary`.
+      truth: of the last look, and whether the target was in sight at any; None before the first.
     """
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
@@ -121,7 +123,7 @@ class OneSlot:
         self.belief = initial_belief(problem)
         self.decision: Decision | None = None
         self.action: Action = no_action()
-        self.shown = False
+        self.truth: Truth | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
         self._sensing: Sensing | None = None
@@ -130,7 +132,7 @@ class OneSlot:
         """See `Slots`."""
         if fresh[0]:
             self.belief = initial_belief(self._problem)
-            self.action, self.observation, self.shown = no_action(), None, False
+            self.action, self.observation, self.truth = no_action(), None, None
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`; accepts any policy."""
@@ -148,10 +150,15 @@ class OneSlot:
         # The first look, before any action, makes the same call, so that nothing is compiled twice.
         before = observation if self.observation is None else self.observation
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
-        self.action, self.shown = no_action(), self.shown or bool(truly_in_sight(self._recogniser, snapshot))
+        self.action = no_action()
+        shown = self.truth is not None and self.truth.shown
+        truth = truth_of(self._recogniser, snapshot, observation)
+        self.truth = truth.replace(shown=truth.shown | shown)
         self.snapshot, self.observation, self.decision = snapshot, observation, None
         belief: Belief = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief)
-        return summary(self._problem, belief, in_base(world, self._sensing), np.array([self.shown]))
+        return summary(
+            self._problem, belief, in_base(world, self._sensing), jax.tree.map(lambda a: a[None], self.truth)
+        )
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -181,10 +188,10 @@ class OneSlot:
         return Snapshot(self._problem.camera, self._problem.shelf, single)
 
 
-def summary(problem: Problem, belief: Belief, world: World, shown: Array | np.ndarray) -> BeliefSummary:
-    """The beliefs of all slots; fields of belief and world, in the base's frame, have a leading axis for them."""
+def summary(problem: Problem, belief: Belief, world: World, truth: Truth) -> BeliefSummary:
+    """The beliefs of all slots; all fields, of the world in the base's frame, have a leading axis for them."""
     size, truth = sizes_and_truths(problem.poses, belief.exists, world)
-    return BeliefSummary(*jax.device_get((belief.found, size, truth, belief.restarts, shown)))
+    return BeliefSummary(*jax.device_get((belief.found, size, truth, belief.restarts, truth.shown, truth.bodies)))
 
 
 @kept()
