@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax.benchmarks.parts import images, segmentation
-from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps
+from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps, true_masks
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
@@ -20,7 +20,7 @@ from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
 
 
-def two_as_one(key, shelf, points, of_target, masks, unseen):
+def two_as_one(key, shelf, points, of_target, masks):
     """The first object taken for a part of the second."""
     return jnp.where(masks == 0, 1, masks)
 

@@ -13,8 +13,9 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle, truth_of
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
+from mechsearch_jax.envs.episode.episode_log import chosen, renumbered
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
@@ -23,7 +24,7 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.planner import initial_belief, search_for_grasp
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -109,6 +110,32 @@ def test_a_detected_target_counts_as_found_once_it_is_truly_in_sight(problem):
     assert first.belief_size == 1
     blind = run(problem, HIDDEN, Stage(), recogniser=Hasty())
     assert (blind.found_step, blind.failure) == (None, "not found")
+
+
+def test_objects_that_are_recognised_by_images_are_named_after_the_nearest_bodies(problem):
+    world = from_scenario(BLOCKED)
+    seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, world))
+    order = np.array([2, 5, 0, 1, 3, 4, 6, 7])
+    shuffled = jax.tree.map(lambda a: a[order], seen.objects)
+    bodies = np.asarray(nearest_bodies(world, shuffled))
+    np.testing.assert_array_equal(bodies[[0, 2, 3]], [2, 0, 1])
+    assert sorted(bodies) == list(range(8))
+    snapshot = Snapshot(problem.camera, problem.shelf, world)
+    np.testing.assert_array_equal(truth_of(oracle, snapshot, seen).bodies, np.arange(8))
+    np.testing.assert_array_equal(truth_of(Hasty(), snapshot, seen).bodies[:3], [0, 1, 2])
+    assert truth_of(informed, snapshot, seen).shown
+    assert not truth_of(Hasty(), snapshot, seen).shown
+
+
+def test_a_choice_is_renumbered_and_back(problem):
+    seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, from_scenario(HIDDEN)))
+    choice = jax.device_get(chosen(grab(jax.random.key(0), problem, initial_belief(problem), seen)))
+    numbers = np.array([3, 0, 1, 2, 4, 5, 6, 7])
+    named = renumbered(choice, numbers)
+    assert (choice.action.object, named.action.object) == (0, 3)
+    assert named.others.object[0] == 3
+    assert renumbered(named, np.argsort(numbers)).action.object == 0
+    assert renumbered(choice, np.arange(8)) is choice
 
 
 @pytest.mark.parametrize("policy", ["grab", "search-for-grasp"])

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window
@@ -132,11 +132,17 @@ def truth_of(recogniser: Recogniser, snapshot: Snapshot, observation: Observatio
     numbers = jnp.arange(TARGET, dtype=jnp.int32)
     if not (isinstance(recogniser, Detects) and recogniser.detects_target):
         return Truth(jnp.array(True), numbers)
-    scene, seen = true_superquadrics(as_seen(snapshot.world, snapshot.sensing)), observation.objects
-    apart = jnp.linalg.norm(seen.position[:, None] - scene.position[None], axis=-1)
-    # An object that is none, and a body that is none, are for each other: they take what the others leave.
-    both = seen.valid[:, None] & scene.valid[None]
-    return Truth(snapshot.target_seen, assign(jnp.where(both, jnp.minimum(apart, FARTHEST), FARTHEST)))
+    return Truth(snapshot.target_seen, nearest_bodies(as_seen(snapshot.world, snapshot.sensing), observation.objects))
+
+
+@kept()
+def nearest_bodies(world: World, objects: Superquadrics) -> Int[Array, " 8"]:
+    """The number of a body for each of eight objects, each body once, with the least sum of their centres' distances."""
+    bodies = true_superquadrics(world)
+    apart = jnp.linalg.norm(objects.position[:, None] - bodies.position[None], axis=-1)
+    # An object that is none, and a body that is none, take what the others leave.
+    both = objects.valid[:, None] & bodies.valid[None]
+    return assign(jnp.where(both, jnp.minimum(apart, FARTHEST), FARTHEST))
 
 
 def oracle(key: Array, snapshot: Snapshot) -> Observation:

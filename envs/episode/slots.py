@@ -156,9 +156,8 @@ class OneSlot:
         self.truth = truth.replace(shown=truth.shown | shown)
         self.snapshot, self.observation, self.decision = snapshot, observation, None
         belief: Belief = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief)
-        return summary(
-            self._problem, belief, in_base(world, self._sensing), jax.tree.map(lambda a: a[None], self.truth)
-        )
+        truth: Truth = jax.tree.map(lambda a: a[None], self.truth)
+        return summary(self._problem, belief, in_base(world, self._sensing), truth)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
