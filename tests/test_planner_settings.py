@@ -113,6 +113,9 @@ def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_pa
     assert workcell == Workcell(target=Target.box(), colour=(0.0, 0.2, 1.0))
     assert workcell.detector == TargetColour.lit((0.0, 0.2, 1.0))
     assert load(tmp_path, "[target]\ncolor = [0, 0.2, 1]").workcell.target == Target()
+    hue = load(tmp_path, "[target]\ncolor = {hue = 240, saturation = 0.8}\nhue_tolerance = 20").workcell
+    np.testing.assert_allclose(hue.colour, (0.2, 0.2, 1.0))
+    assert hue.detector == TargetColour.lit(hue.colour, 20.0)
     setting = types.SimpleNamespace(camera=Camera(), shelf=Shelf(), target=Target())
     searcher = Searcher(workcell)
     searcher.problem = setting
@@ -122,6 +125,9 @@ def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_pa
 WRONG = {
     "[target]\ncolor = [255, 0, 0]": ":2: [target] color (255.0, 0.0, 0.0) must be red, green and blue, each",
     "[target]\n\ncolor = [1, 1, 1]": ":3: [target] color (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
+    "[target]\ncolor = {hue = 400, saturation = 1}": ":2: [target] color: hue (400.0) must be from 0 to 360 degrees",
+    "[target]\ncolor = {hue = 40}": ":2: [target] color must be red, green and blue, or {hue = DEGREES",
+    "[target]\nhue_tolerance = 90": ":2: [target] hue_tolerance (90.0) must be from 1 to 60 degrees",
     "[target]\ncolor = [1, 1]": ":2: [target] color must be a list of 3, not of 2",
     "[target]\ncolour = [1, 0, 0]": ":2: [target] colour is unknown; did you mean color?",
     "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
