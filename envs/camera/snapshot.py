@@ -137,7 +137,7 @@ def truth_of(recogniser: Recogniser, snapshot: Snapshot, observation: Observatio
 
 @kept()
 def nearest_bodies(world: World, objects: Superquadrics) -> Int[Array, " 8"]:
-    """The number of a body for each of eight objects, each body once: those with the least sum of centres' distances."""
+    """The number of a body for each of eight objects, each body once, with the least sum of distances of centres."""
     bodies = true_superquadrics(world)
     apart = jnp.linalg.norm(objects.position[:, None] - bodies.position[None], axis=-1)
     # An object that is none, and a body that is none, take what the others leave.
