@@ -28,9 +28,10 @@ PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "sof
 FARTHEST, STEEPEST = 0.2, 20.0
 # Standard deviation of the usual depth noise [m].
 USUAL_NOISE = 0.001
-# Standard deviation of the usual noise in each channel of colour, 4 of 255, and the usual least difference of the objects' hues
-# from the target's [degrees].
-USUAL_COLOUR_NOISE, USUAL_HUE_GAP = 0.016, 40.0
+# Standard deviation of the usual noise in each channel of colour, 4 of 255.
+USUAL_COLOUR_NOISE = 0.016
+# The usual least difference of the objects' hues from the target's [degrees].
+USUAL_HUE_GAP = 40.0
 
 
 @dataclasses.dataclass(frozen=True)
