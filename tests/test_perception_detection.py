@@ -64,6 +64,13 @@ def test_a_thing_of_the_targets_colour_but_not_of_its_shape_is_an_object(body):
     assert not found.pixels.any()
 
 
+@pytest.mark.parametrize("body", [LARGE, FLAT])
+def test_the_target_is_found_beside_another_thing_of_its_colour(body):
+    found, owner = seen(body, RED)
+    assert found.visible
+    np.testing.assert_array_equal(found.pixels & (owner != SHELF), owner == TARGET)
+
+
 def test_what_is_farther_away_than_the_target_is_large_is_not_the_targets():
     place = jnp.stack(jnp.meshgrid(jnp.arange(40) * 0.01, jnp.arange(40) * 0.01, indexing="ij"), axis=-1)
     points = jnp.concatenate([place, jnp.zeros((40, 40, 1))], axis=-1)

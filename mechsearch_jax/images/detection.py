@@ -21,6 +21,8 @@ from mechsearch_jax.workspace.target import Target
 
 # Number of points among which the densest place is sought.
 CENTRES = 256
+# How many things of the target's colour are looked at, the one with the densest pixels first.
+PLACES = 3
 # What has the target's colour has its shape, too, if at least this share of its points lies within so many metres of
 # the surface of the fitted target: three times the tolerance for points that are added, since depth may be noisier.
 SHARE_ON_SURFACE, TOLERANCE = 0.5, 0.012
@@ -58,9 +60,9 @@ def detect(
 ) -> Detection:
     """Find the target's pixels.
 
-    Pixels of the target's colour are the target's where they are dense: those that are farther from their densest place
-    than the target is large are something else's. The target is visible if the rest are more than the threshold and
-    have its shape.
+    Pixels of the target's colour are gathered at their densest place: those that are farther away than the target is
+    large are something else's. They are the target if they are more than the threshold and have its shape; else the
+    next densest place is looked at, up to `PLACES` of them.
 
     Args:
       key: PRNG key of the drawn points.
@@ -74,17 +76,22 @@ def detect(
     """
     # Points on the board's faces may be the target's.
     near = above_board(shelf, points, -MARGIN)
-    coloured = in_one_place(key, target, points, coloured_pixels(detector, colour, depth) & near)
-    pose, _ = fitted_pose(jax.random.fold_in(key, 0), target, shelf, camera, points, coloured)
-    enough = jnp.sum(coloured) > threshold
-    # Something else of the target's colour is an object; what shows too little to tell is none.
-    coloured &= ~enough | has_shape(target, shelf, pose, points, coloured)
-    visible = enough & jnp.any(coloured)
-    on_it = near_target(target, shelf, pose, points) & near & visible
+    left = coloured_pixels(detector, colour, depth) & near
+    chosen, on_it, visible = jnp.zeros(depth.shape, bool), jnp.zeros(depth.shape, bool), jnp.zeros((), bool)
+    for place in range(PLACES):
+        place_key = jax.random.fold_in(key, place)
+        here = in_one_place(place_key, target, points, left)
+        pose, _ = fitted_pose(place_key, target, shelf, camera, points, here)
+        enough = jnp.sum(here) > threshold
+        fits = enough & has_shape(target, shelf, pose, points, here) & ~visible
+        # Where too little shows to tell, nothing is an object.
+        unclear = ~enough if place == 0 else jnp.zeros((), bool)
+        chosen |= here & (fits | unclear)
+        on_it |= near_target(target, shelf, pose, points) & near & fits
+        visible, left = visible | fits, left & ~here
     # The pose is unreliable if it would add more pixels than the colour shows.
-    on_it &= jnp.sum(on_it & ~coloured) <= jnp.sum(coloured)
-    # Casts avoid weak types, with which functions of the result would be compiled again.
-    return Detection(coloured, coloured | on_it, visible.astype(bool))
+    on_it &= jnp.sum(on_it & ~chosen) <= jnp.sum(chosen)
+    return Detection(chosen, chosen | on_it, visible)
 
 
 def in_one_place(
