@@ -149,14 +149,14 @@ def shown():
     return see
 
 
-@pytest.mark.parametrize(("y", "in_sight"), [(0.0, False), (-0.048, True)])
+@pytest.mark.parametrize(("y", "in_sight"), [(-0.03, False), (-0.06, True)])
 def test_full_finds_the_target_in_colour_where_it_is_in_sight(world, shown, y, in_sight):
     x, _, z = SCENE.target.position
     image, owner, seen = shown(moved(world, TARGET, [x, y, z]))
     assert seen == in_sight
     assert image.of_target.any() == in_sight
     true = owner == TARGET
-    assert np.sum(true) > 100 or not in_sight
+    assert np.sum(true) > 60 or not in_sight
     if in_sight:
         named = image.labels == 8
         assert np.sum(named & true) > 0.95 * np.sum(true)

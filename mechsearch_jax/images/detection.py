@@ -24,8 +24,8 @@ CENTRES = 256
 # How many things of the target's colour are looked at, the one with the densest pixels first.
 PLACES = 3
 # What has the target's colour has its shape, too, if at least this share of its points lies within so many metres of
-# the surface of the fitted target: three times the tolerance for points that are added, since depth may be noisier.
-SHARE_ON_SURFACE, TOLERANCE = 0.5, 0.012
+# the surface of the fitted target: twice the tolerance for points that are added, since depth may be noisier.
+SHARE_ON_SURFACE, TOLERANCE = 0.7, 0.008
 
 
 class Detection(flax.struct.PyTreeNode):
