@@ -5,7 +5,7 @@
 - `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
 - `full` receives a noisy depth and a noisy colour image alone and segments them.
 
-`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. `oracle` and `masks` are told whether
+`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. `oracle` and `masks` know whether
 the target shows more than 100 pixels, and `masks` then which; only the oracle gets the target's pose. `full` finds the
 target by itself in a depth and a colour image, by `images.detection.detect`, as on a robot.
 """
