@@ -65,7 +65,7 @@ def drawn_appearance(
     hue_key, other_key, light_key = jax.random.split(key, 3)
     gap = jnp.asarray(hue_gap) / 360.0
     hue = colorsys.rgb_to_hsv(*target)[0] + gap + (1.0 - 2.0 * gap) * jax.random.uniform(hue_key, (TARGET,))
-    low, high = (jnp.array(ends) for ends in zip(SATURATIONS, BRIGHTNESSES, strict=True))
+    low, high = (jnp.array([ends]) for ends in zip(SATURATIONS, BRIGHTNESSES, strict=True))
     saturation, brightness = jnp.moveaxis(low + (high - low) * jax.random.uniform(other_key, (TARGET, 2)), -1, 0)
     colours = jnp.concatenate([_rgb(hue, saturation, brightness), jnp.array([target]), PALETTE[SHELF:]])
     light = np.array(LIGHT, np.float32) / math.hypot(*LIGHT) + LIGHT_SPREAD * jax.random.normal(light_key, (3,))
@@ -87,6 +87,6 @@ def sensed_colour(key: Key[Array, ""], colour: Float[Array, "h w 3"], sensing: C
 
 def _rgb(hue: Array, saturation: Array, brightness: Array) -> Float[Array, " n 3"]:
     """Red, green and blue of a hue in turns, a saturation and a brightness in 0 to 1."""
-    sector = jnp.mod(jnp.array([5.0, 3.0, 1.0]) + 6.0 * hue[:, None], 6.0)
+    sector = jnp.mod(jnp.array([[5.0, 3.0, 1.0]]) + 6.0 * hue[:, None], 6.0)
     share = jnp.clip(jnp.minimum(sector, 4.0 - sector), 0.0, 1.0)
     return brightness[:, None] * (1.0 - saturation[:, None] * share)

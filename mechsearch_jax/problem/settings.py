@@ -176,7 +176,9 @@ def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
     if value.keys() != {"hue", "saturation"}:
         raise InputError(f"{where} must be red, green and blue, or {{hue = DEGREES, saturation = SHARE}}")
     hue, saturation = (checked(value[name], float, f"{where} {name}") for name in ("hue", "saturation"))
-    return apply(document, "target", {COLOR: (hue, saturation)}, lambda numbers: rgb_of_hue(*numbers[COLOR]))
+    return apply(
+        document, "target", {COLOR: (hue, saturation)}, lambda numbers: rgb_of_hue(*numbers.get(COLOR, (0.0, 1.0)))
+    )
 
 
 def _target(document: Document) -> Target:
