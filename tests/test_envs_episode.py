@@ -10,21 +10,22 @@ import pytest
 from rich.console import Console
 from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, push_off, reveal, topple
 
-from mechsearch_jax.actions import kind_of
+from mechsearch_jax.actions import ActionKind, kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle, truth_of
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, nearest_bodies, oracle, truth_of
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
-from mechsearch_jax.envs.episode.episode_log import chosen, renumbered
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.protocols import WithTruePose
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
 from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
+from mechsearch_jax.envs.recording.pictures import frame
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import initial_belief, search_for_grasp
+from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -112,30 +113,145 @@ def test_a_detected_target_counts_as_found_once_it_is_truly_in_sight(problem):
     assert (blind.found_step, blind.failure) == (None, "not found")
 
 
-def test_objects_that_are_recognised_by_images_are_named_after_the_nearest_bodies(problem):
+@dataclasses.dataclass(frozen=True)
+class Shuffled:
+    """A recogniser that detects the target by itself, and numbers the objects of another in an order of its own.
+
+    Attributes:
+      order: the number in `inner` of each object.
+      inner: the other recogniser.
+    """
+
+    order: tuple[int, ...]
+    inner: Recogniser = oracle
+    detects_target: bool = True
+
+    def __call__(self, key, snapshot):
+        seen = self.inner(key, snapshot)
+        return seen.replace(objects=jax.tree.map(lambda a: a[np.array(self.order)], seen.objects))
+
+
+def grab_nearest(key, problem, belief, observation):
+    """`grab`, but the object that is nearest to the robot is pushed, whatever its number."""
+    x = jnp.where(observation.objects.valid, observation.objects.position[:, 0], jnp.inf)
+    decision = grab(key, problem, belief, observation)
+    pushes = decision.action.kind == ActionKind.PUSH
+    index = jnp.argmin(x).astype(jnp.int32)
+    actions = decision.sequences.actions
+    return decision.replace(
+        action=decision.action.replace(object=jnp.where(pushes, index, decision.action.object)),
+        sequences=decision.sequences.replace(actions=actions.replace(object=jnp.full((1, 1), index))),
+    )
+
+
+def test_objects_are_named_after_the_nearest_bodies(problem):
     world = from_scenario(BLOCKED)
-    seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, world))
+    snapshot = Snapshot(problem.camera, problem.shelf, world)
+    seen = oracle(jax.random.key(0), snapshot)
     order = np.array([2, 5, 0, 1, 3, 4, 6, 7])
-    shuffled = jax.tree.map(lambda a: a[order], seen.objects)
-    bodies = np.asarray(nearest_bodies(world, shuffled))
+    bodies, there = (np.asarray(a) for a in nearest_bodies(world, jax.tree.map(lambda a: a[order], seen.objects)))
     np.testing.assert_array_equal(bodies[[0, 2, 3]], [2, 0, 1])
     assert sorted(bodies) == list(range(8))
-    snapshot = Snapshot(problem.camera, problem.shelf, world)
+    np.testing.assert_array_equal(there, np.isin(order, [0, 1, 2]))
     np.testing.assert_array_equal(truth_of(oracle, snapshot, seen).bodies, np.arange(8))
-    np.testing.assert_array_equal(truth_of(Hasty(), snapshot, seen).bodies[:3], [0, 1, 2])
-    assert truth_of(informed, snapshot, seen).shown
-    assert not truth_of(Hasty(), snapshot, seen).shown
+    np.testing.assert_array_equal(truth_of(Shuffled(tuple(order)), snapshot, seen).bodies[:3], [0, 1, 2])
+    # One that is recognised where nothing is stands for no body, and has the number of an empty slot.
+    astray = seen.objects.replace(position=seen.objects.position.at[1, 2].add(0.11))
+    bodies, there = (np.asarray(a) for a in nearest_bodies(world, astray))
+    np.testing.assert_array_equal(bodies[[0, 2]], [0, 2])
+    assert bodies[1] >= 3
+    np.testing.assert_array_equal(there[:3], [True, False, True])
 
 
-def test_a_choice_is_renumbered_and_back(problem):
-    seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, from_scenario(HIDDEN)))
-    choice = jax.device_get(chosen(grab(jax.random.key(0), problem, initial_belief(problem), seen)))
-    numbers = np.array([3, 0, 1, 2, 4, 5, 6, 7])
-    named = renumbered(choice, numbers)
-    assert (choice.action.object, named.action.object) == (0, 3)
-    assert named.others.object[0] == 3
-    assert renumbered(named, np.argsort(numbers)).action.object == 0
-    assert renumbered(choice, np.arange(8)) is choice
+def test_the_sum_of_distances_decides_which_body_an_object_stands_for(problem):
+    world = from_scenario(BLOCKED)
+    place = world.position[0]
+    world = world.replace(
+        position=world.position.at[:3].set(place[None] + jnp.array([[0, 0, 0], [0, 0.03, 0], [0, 0.3, 0]]))
+    )
+    seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, world))
+    # The first is nearest to body 0, but the second can be nothing else: body 1 is too far from it.
+    y = place[None] + jnp.array([[0.0, 0.01, 0.0], [0.0, -0.08, 0.0], [0.0, 0.31, 0.0]])
+    bodies, there = nearest_bodies(world, seen.objects.replace(position=seen.objects.position.at[:3].set(y)))
+    np.testing.assert_array_equal(bodies[:3], [1, 0, 2])
+    assert np.asarray(there)[:3].all()
+
+
+def test_a_detection_is_the_target_only_where_the_target_is_in_sight(problem):
+    hasty = Hasty()
+    shown = {}
+    for name, scenario in {"hidden": HIDDEN, "open": OPEN}.items():
+        snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
+        seen = hasty(jax.random.key(0), snapshot)
+        elsewhere = seen.replace(target_pose=seen.target_pose + jnp.array([0.0, 0.15, 0.0]))
+        unseen = seen.replace(target_visible=jnp.array(False))
+        shown[name] = [bool(truth_of(hasty, snapshot, look).shown) for look in (seen, elsewhere, unseen)]
+        assert truth_of(informed, snapshot, seen).shown
+    assert shown == {"hidden": [False, False, False], "open": [True, False, False]}
+
+
+def test_the_published_protocol_gives_the_pose_of_a_detected_target_only(problem):
+    """Not of a hidden one, for which something else is taken."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Mistaken:
+        detects_target: bool = True
+
+        def __call__(self, key, snapshot):
+            seen = informed(key, snapshot)
+            return seen.replace(target_pose=seen.target_pose + jnp.array([0.02, 0.0, 0.0]))
+
+    for scenario, given in ((HIDDEN, False), (OPEN, True)):
+        snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
+        pose = WithTruePose(Mistaken())(jax.random.key(0), snapshot).target_pose
+        expected = np.asarray(snapshot.target_pose) + (0.0 if given else 0.02) * np.array([1.0, 0.0, 0.0])
+        np.testing.assert_allclose(pose, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0, 3, 4, 5, 6, 7), (7, 6, 5, 4, 3, 2, 1, 0)])
+def test_objects_in_any_order_give_the_same_decisions_and_names_follow_the_bodies(problem, order):
+    diaries, stages, records = [], [], []
+    for recogniser in (oracle, Shuffled(order)):
+        diary, stage = Diary(), Stage()
+        episode = run(problem, BLOCKED, stage, grab_nearest, diary, recogniser=recogniser)
+        diaries.append(diary)
+        stages.append(stage)
+        records.append([dataclasses.replace(step, timings={}) for step in episode.steps])
+    assert records[0] == records[1]
+    assert [step.action.object for step in records[0][:2]] == [0, 0]
+    assert [int(action.object) for action in stages[1].actions] == [int(action.object) for action in stages[0].actions]
+    for plain, shuffled in zip(*(diary.moments for diary in diaries), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, plain.observation, shuffled.observation)
+        if plain.decision is not None:
+            jax.tree.map(np.testing.assert_array_equal, plain.decision, shuffled.decision)
+            assert frame(plain, problem).title == frame(shuffled, problem).title
+
+
+def test_an_object_that_is_not_there_is_none_in_the_record(problem):
+    @dataclasses.dataclass(frozen=True)
+    class Phantom:
+        detects_target: bool = True
+
+        def __call__(self, key, snapshot):
+            seen = oracle(key, snapshot)
+            place = jnp.array([0.5, -0.3, 0.48])
+            return seen.replace(objects=seen.objects.replace(position=seen.objects.position.at[0].set(place)))
+
+    stage = Stage()
+    episode = run(problem, BLOCKED, stage, recogniser=Phantom())
+    assert episode.steps[0].action.kind == "push"
+    assert episode.steps[0].action.object is None
+    # For the simulator it is an empty slot.
+    assert int(stage.actions[0].object) >= len(BLOCKED.objects)
+
+
+def test_narration_says_that_something_else_is_taken_for_the_target(problem):
+    text = io.StringIO()
+    console = Console(file=text, width=200)
+    with console.status("") as status:
+        run(problem, HIDDEN, Stage(reveal), watcher=Narrator(console, status, problem), recogniser=Hasty())
+    assert "that it takes for the target" in text.getvalue()
+    assert "the target at x 0.620" in text.getvalue()
 
 
 @pytest.mark.parametrize("policy", ["grab", "search-for-grasp"])

@@ -190,7 +190,7 @@ def test_exposure_and_noise_of_colour_are_as_given():
     full, view = recogniser("full", target_of(SCENE)), shelf_view(CAMERA, SHELF)
     world = from_scenario(SCENE)
     appearance = drawn_appearance(scene_key(world), full.detector.rgb, 40.0)
-    plain = np.asarray(observe(view.camera, world, SHELF, appearance).colour)
+    plain = observe(view.camera, world, SHELF, appearance).colour
     for mismatch in (Mismatch(exposure=0.5), Mismatch(exposure=1.5, color_noise=8 / 255, white_balance=0.1)):
         seen = np.asarray(sensed_colour(jax.random.key(1), plain, sensed(mismatch).colour))
         assert seen.min() >= 0.0

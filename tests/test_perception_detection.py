@@ -1,17 +1,22 @@
 """The target in colour and depth: what is its own, what is another thing of its colour, and when it is visible."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, Appearance, observe
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.colour import RED, TargetColour, hue_difference, rgb_of_hue
-from mechsearch_jax.images.detection import detect, in_one_place, no_detection
+from mechsearch_jax.images.detection import ColouredDepth, densest_place, detect, no_detection
+from mechsearch_jax.images.noise import RandomDirection, depth_of
+from mechsearch_jax.images.target_evidence import depth_tolerance
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -19,21 +24,43 @@ from mechsearch_jax.workspace.target import Target
 KEY, BOARD = jax.random.key(0), Shelf()
 VIEW = shelf_view(Camera(), BOARD, 4)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-CAN = Body("cylinder", (0.02, 0.02, 0.05), (0.6, 0.1, BOARD.board + 0.05), UPRIGHT)
-# A box that is larger than the target, and one that is not.
-LARGE = Body("box", (0.06, 0.06, 0.08), (0.6, -0.12, BOARD.board + 0.08), UPRIGHT)
-FLAT = Body("box", (0.01, 0.045, 0.045), (0.6, -0.12, BOARD.board + 0.045), UPRIGHT)
+LIGHT = (-0.6, 0.3, 0.7)
+X, Y = 0.6, 0.1
 
 
-def seen(other, colour, light=(-0.6, 0.3, 0.7), detector=None, valid=True):
+def standing(shape, half_size, x=X, y=-0.12, turn=UPRIGHT):
+    return Body(shape, half_size, (x, y, BOARD.board + half_size[2]), turn)
+
+
+CAN = standing("cylinder", (0.02, 0.02, 0.05), X, Y)
+# Things that are not of the target's shape or size.
+LARGE, FLAT, CUBE = (
+    standing("box", half_size) for half_size in ((0.06, 0.06, 0.08), (0.01, 0.045, 0.045), (0.02, 0.02, 0.02))
+)
+TALL, WIDE, SHORT = (
+    standing("cylinder", half_size) for half_size in ((0.02, 0.02, 0.1), (0.03, 0.03, 0.05), (0.02, 0.02, 0.03))
+)
+OTHERS = {"large": LARGE, "flat": FLAT, "cube": CUBE, "tall": TALL, "wide": WIDE, "short": SHORT}
+# From the target towards the camera, and to the side, level.
+TOWARDS = np.array(Camera().position[:2]) - (X, Y)
+TOWARDS = TOWARDS / np.linalg.norm(TOWARDS)
+ASIDE = np.array([-TOWARDS[1], TOWARDS[0]])
+
+
+@functools.cache
+def detection(detector, threshold):
+    return jax.jit(lambda image: detect(KEY, detector, Target.cylinder(), BOARD, VIEW.camera, image, threshold))
+
+
+def seen(other, colour, light=LIGHT, detector=None, can=CAN, threshold=6.0):
     """What is detected of a red target beside another body of a colour, and what each pixel shows."""
-    world = from_scenario(Scenario("two", (other,), CAN))
-    world = world.replace(valid=world.valid.at[TARGET].set(valid))
+    world = from_scenario(Scenario("two", (other,), can or CAN))
+    world = world.replace(valid=world.valid.at[TARGET].set(can is not None))
     colours = jnp.asarray(PALETTE).at[0].set(jnp.array(colour))
     image = observe(VIEW.camera, world, BOARD, Appearance(colours, jnp.array(light)))
-    points = back_project(VIEW.camera, image.depth)
-    eyes = detector or TargetColour.lit()
-    found = detect(KEY, eyes, Target.cylinder(), BOARD, VIEW.camera, points, image.depth, image.colour, 6.0)
+    points = RandomDirection()(KEY, VIEW.camera, image.depth)
+    depth = depth_of(VIEW.camera, points)
+    found = detection(detector or TargetColour.lit(), threshold)(ColouredDepth(points, depth, image.colour))
     return jax.tree.map(np.asarray, found), np.asarray(image.segmentation)
 
 
@@ -52,10 +79,10 @@ def test_the_target_is_detected_in_any_light_and_nothing_else_is(light):
 
 
 def test_without_the_target_nothing_is_detected():
-    found, _ = seen(LARGE, PALETTE[1], valid=False)
+    found, _ = seen(LARGE, PALETTE[1], can=None)
     assert not found.visible
     assert not found.pixels.any()
-    assert not no_detection(found.pixels).visible
+    assert not no_detection(jnp.zeros((3, 4))).visible
 
 
 def test_another_hue_is_not_the_targets():
@@ -63,27 +90,73 @@ def test_another_hue_is_not_the_targets():
     assert not found.visible
 
 
-@pytest.mark.parametrize("body", [LARGE, FLAT])
-def test_a_thing_of_the_targets_colour_but_not_of_its_shape_is_an_object(body):
-    found, _ = seen(body, RED, valid=False)
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_thing_of_the_targets_colour_but_not_of_its_shape_and_size_is_an_object(name):
+    found, _ = seen(OTHERS[name], RED, can=None)
     assert not found.visible
     assert not found.pixels.any()
+    assert not found.unclear.any()
 
 
-@pytest.mark.parametrize("body", [LARGE, FLAT])
-def test_the_target_is_found_beside_another_thing_of_its_colour(body):
-    found, owner = seen(body, RED)
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_target_is_found_beside_another_thing_of_its_colour(name):
+    found, owner = seen(OTHERS[name], RED)
     assert found.visible
     assert_on_target(found.pixels, owner)
 
 
-def test_what_is_farther_away_than_the_target_is_large_is_not_the_targets():
+@pytest.mark.parametrize("aside", [-0.03, -0.02, 0.02, 0.03])
+def test_the_target_is_found_behind_a_thing_of_another_colour(aside):
+    x, y = np.array([X, Y]) + 0.09 * TOWARDS + aside * ASIDE
+    whole = np.sum(seen(LARGE, PALETTE[1])[1] == TARGET)
+    found, owner = seen(standing("cylinder", (0.025, 0.025, 0.08), x, y), PALETTE[1])
+    assert 0.2 * whole < np.sum(owner == TARGET) < 0.8 * whole
+    assert found.visible
+    assert np.sum(found.pixels & (owner == TARGET)) > 0.95 * np.sum(owner == TARGET)
+    assert np.sum(found.pixels & (owner != TARGET)) < 0.1 * np.sum(owner == TARGET)
+
+
+@pytest.mark.parametrize(("axis", "degrees"), [("x", 20), ("y", 40), ("y", 90), ("x", 90)])
+def test_a_target_that_leans_or_lies_is_detected(axis, degrees):
+    x, y, z, w = Rotation.from_euler(axis, degrees, degrees=True).as_quat()
+    tilt = np.radians(degrees)
+    height = 0.02 * np.sin(tilt) + 0.05 * np.cos(tilt) if degrees < 90 else 0.02
+    body = Body("cylinder", CAN.half_size, (X, Y, BOARD.board + height), (w, x, y, z))
+    found, owner = seen(LARGE, PALETTE[1], can=body)
+    assert found.visible
+    # A few of the board's pixels next to it, too.
+    assert_on_target(found.pixels & ((owner == TARGET) | (owner < TARGET)), owner)
+
+
+def test_specks_of_the_targets_colour_are_unclear():
+    """They are no target, but neither may they be an object that rules out where the target is."""
+    x, y = np.array([X, Y]) + 0.09 * TOWARDS + 0.01 * ASIDE
+    pillar = standing("cylinder", (0.025, 0.025, 0.08), x, y)
+    assert seen(pillar, PALETTE[1])[0].visible
+    found, owner = seen(pillar, PALETTE[1], threshold=25.0)
+    assert 10 < np.sum(owner == TARGET) < 25
+    assert not found.visible
+    assert not found.pixels.any()
+    np.testing.assert_array_equal(found.unclear, owner == TARGET)
+
+
+def test_the_densest_place_is_on_the_largest_thing():
     place = jnp.stack(jnp.meshgrid(jnp.arange(40) * 0.01, jnp.arange(40) * 0.01, indexing="ij"), axis=-1)
     points = jnp.concatenate([place, jnp.zeros((40, 40, 1))], axis=-1)
     coloured = jnp.zeros((40, 40), bool).at[2:8, 2:6].set(True)
     scattered = coloured.at[30, 30].set(True).at[10, 38].set(True).at[39, 1].set(True)
-    np.testing.assert_array_equal(in_one_place(KEY, Target.cylinder(), points, scattered), coloured)
-    assert not in_one_place(KEY, Target.cylinder(), points, jnp.zeros((40, 40), bool)).any()
+    x, y, _ = np.asarray(densest_place(KEY, Target.cylinder(), points, scattered))
+    assert 0.02 <= x <= 0.07
+    assert 0.02 <= y <= 0.05
+
+
+def test_the_tolerance_is_four_deviations_of_the_depths_noise():
+    depth = 0.7 + 0.001 * jnp.arange(100.0)[None] + 0.0012 * jax.random.normal(KEY, (100, 100))
+    assert float(depth_tolerance(depth, jnp.ones((100, 100), bool))) == pytest.approx(0.0048, rel=0.03)
+    rough = depth.at[:, ::10].set(jnp.nan)
+    assert float(depth_tolerance(rough, jnp.ones((100, 100), bool))) == pytest.approx(0.0048, rel=0.05)
+    assert float(depth_tolerance(jnp.full((5, 5), 0.7), jnp.ones((5, 5), bool))) == pytest.approx(0.003)
+    assert float(depth_tolerance(depth, jnp.zeros((100, 100), bool))) == pytest.approx(0.008)
 
 
 def test_a_hue_and_a_tolerance_make_a_detector():

@@ -28,7 +28,7 @@ from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, 
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.images.cloud import MARGIN, View, above_board
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.images.detection import Detection, detect
+from mechsearch_jax.images.detection import ColouredDepth, Detection, detect
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.networks.weights import Weights, shipped_weights
@@ -210,9 +210,7 @@ def sighted(
         recogniser.target,
         shelf,
         view.camera,
-        points,
-        depth,
-        colour,
+        ColouredDepth(points, depth, colour),
         unseen,
     )
     return image, points, depth, detection
@@ -238,7 +236,7 @@ def detected(
     """
     _, points, depth, detection = sighted(keys[0], recogniser, view, shelf, world, unseen, sensing)
     # As objects, small segments would rule out the pose of a target that is not detected.
-    segments = recogniser.segmenter(keys[1], shelf, points, detection.pixels)
+    segments = recogniser.segmenter(keys[1], shelf, points, detection.pixels | detection.unclear)
     labels = large_segments(segments, SAMPLED * unseen)
     of_target = detection.pixels & above_board(shelf, points) & detection.visible
     return LabelledImage(points, depth, labels, of_target), detection.visible

@@ -23,8 +23,8 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Distance that stands for all larger ones, between what is recognised and what is there [m].
-FARTHEST = 10.0
+# What is recognised farther than this from a body stands for another one, or for none [m].
+NEAR = 0.1
 
 
 class Sight(flax.struct.PyTreeNode):
@@ -116,33 +116,58 @@ class Truth(flax.struct.PyTreeNode):
     """What a look truly shows, for verdicts and records; the planner does not know it.
 
     Attributes:
-      shown: whether the target is truly in sight, or the recogniser knows it from the truth anyway.
-      bodies: the number of the body that each recognised object stands for, each body once, int32, shape (8,).
+      shown: whether what is taken for the target is the target, and in sight, or comes from the truth anyway.
+      bodies: the number of the body that each recognised object stands for, each number once, int32, shape (8,).
+      there: whether it stands for that body; one that stands for none has the number of an empty slot, if there is
+        one, shape (8,).
     """
 
     shown: jax.Array
     bodies: jax.Array
+    there: jax.Array
 
 
 def truth_of(recogniser: Recogniser, snapshot: Snapshot, observation: Observation) -> Truth:
     """The truth of a look, at which a recogniser made an observation.
 
-    The recognisers that know the truth have its numbers. Of the others the bodies are those whose centres are nearest.
+    The recognisers that know the truth have its numbers. Of the others the bodies are those that are nearest.
     """
-    numbers = jnp.arange(TARGET, dtype=jnp.int32)
-    if not (isinstance(recogniser, Detects) and recogniser.detects_target):
-        return Truth(jnp.array(True), numbers)
-    return Truth(snapshot.target_seen, nearest_bodies(as_seen(snapshot.world, snapshot.sensing), observation.objects))
+    if not detects(recogniser):
+        return truth_unseen(shown=True)
+    bodies, there = nearest_bodies(as_seen(snapshot.world, snapshot.sensing), observation.objects)
+    return Truth(is_the_target(snapshot, observation), bodies, there)
+
+
+def truth_unseen(shown: bool = False) -> Truth:
+    """The truth where objects have the numbers of bodies."""
+    return Truth(jnp.array(shown), jnp.arange(TARGET, dtype=jnp.int32), jnp.ones(TARGET, bool))
+
+
+def detects(recogniser: Recogniser) -> bool:
+    """Whether a recogniser detects the target in images, and may take something else for it."""
+    return isinstance(recogniser, Detects) and recogniser.detects_target
+
+
+def is_the_target(snapshot: Snapshot, observation: Observation) -> Bool[Array, ""]:
+    """Whether the target is detected where it is, and truly in sight."""
+    apart = observation.target_pose[:2] - snapshot.target_pose[:2]
+    return observation.target_visible & snapshot.target_seen & (jnp.sum(apart**2) < NEAR**2)
 
 
 @kept()
-def nearest_bodies(world: World, objects: Superquadrics) -> Int[Array, " 8"]:
-    """The number of a body for each of eight objects, each body once, with the least sum of distances of centres."""
+def nearest_bodies(world: World, objects: Superquadrics) -> tuple[Int[Array, " 8"], Bool[Array, " 8"]]:
+    """The number of a body for each of eight objects, each number once, and whether the object stands for that body.
+
+    The sum of the distances of centres is least, where those above `NEAR` count as that. Objects that stand for no body
+    have the numbers of empty slots, if there are any.
+    """
     bodies = true_superquadrics(world)
     apart = jnp.linalg.norm(objects.position[:, None] - bodies.position[None], axis=-1)
-    # An object that is none, and a body that is none, take what the others leave.
-    both = objects.valid[:, None] & bodies.valid[None]
-    return assign(jnp.where(both, jnp.minimum(apart, FARTHEST), FARTHEST))
+    near = objects.valid[:, None] & bodies.valid[None] & (apart < NEAR)
+    # An object that is none takes what the others leave.
+    wrong = jnp.where(bodies.valid, 2 * NEAR, NEAR)[None]
+    numbers = assign(jnp.where(objects.valid[:, None], jnp.where(near, apart, wrong), 0.0))
+    return numbers, jnp.take_along_axis(near, numbers[:, None], axis=1)[:, 0]
 
 
 def oracle(key: Array, snapshot: Snapshot) -> Observation:

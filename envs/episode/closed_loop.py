@@ -20,12 +20,12 @@ from mechsearch_jax.envs.episode.episode_log import (
     distrust,
     overflow_trouble,
     record,
-    renumbered,
     result_of,
     takes_target,
     target_trouble,
 )
 from mechsearch_jax.envs.episode.moments import Moment, Watcher
+from mechsearch_jax.envs.episode.numbering import named_decision, named_observation
 from mechsearch_jax.envs.episode.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
@@ -151,8 +151,6 @@ class EpisodePool:
         self._clock = StageClock(count, listeners.stage, compiling)
         # What is being done in the slots that wait for the end of it.
         self._moving: dict[int, Choice] = {}
-        # The bodies that the recognised objects of every slot stand for; `Slots` number objects, the simulator bodies.
-        self._bodies: Int[np.ndarray, "slots 8"] = np.zeros((count, 0), np.int32)
         key = jax.random.key_data(jax.random.key(0))
         self._keys: UInt[np.ndarray, "slots 2 *words"] = np.zeros((count, 2, *key.shape), key.dtype)
 
@@ -195,9 +193,9 @@ class EpisodePool:
         deciding = [r for r in logs if r not in trouble and (found[r] or not logs[r].last)]
         with clock("plan", deciding):
             choices = self._planner.decide(planner_keys, deciding)
-        self._bodies = knowledge.bodies
+        # `Slots` number objects as they were recognised, the simulator and records number bodies.
         choices = {
-            r: renumbered(choice, self._bodies[r])
+            r: choice.replace(bodies=knowledge.bodies[r], there=knowledge.there[r])
             for r, choice in choices.items()
             if not logs[r].last or takes_target(choice)
         }
@@ -235,8 +233,7 @@ class EpisodePool:
             if acting or self._moving:
                 executed = self._executed({r: choices[r] for r in acting})
                 others = {r: choice for r, choice in executed.choices.items() if choice is not choices.get(r, choice)}
-                taken = {r: renumbered(choice, np.argsort(self._bodies[r])) for r, choice in others.items()}
-                self._planner.took({r: choice.action for r, choice in taken.items()})
+                self._planner.took({r: choice.action for r, choice in others.items()})
                 for r, choice in others.items():
                     decided[r].log.took(choice)
 
@@ -275,13 +272,20 @@ class EpisodePool:
         return {**options, "target": shape, "simulator": engine, "seed": start.seed}
 
     def _moment(self, choices: Mapping[int, Choice]) -> Moment | None:
-        """What is known in a single slot."""
+        """What is known in a single slot, for a watcher."""
         slot = self._planner
-        if not isinstance(slot, OneSlot) or slot.snapshot is None or slot.observation is None:
+        if (
+            self._listeners.watcher is None
+            or not isinstance(slot, OneSlot)
+            or slot.snapshot is None
+            or slot.observation is None
+            or slot.truth is None
+        ):
             return None
-        log = self.running[0].log
-        decision = slot.decision if 0 in choices else None
-        return Moment(log.index, slot.snapshot, slot.observation, slot.belief, decision, log.steps[-1], None)
+        log, bodies = self.running[0].log, np.asarray(slot.truth.bodies)
+        decision = named_decision(slot.decision, bodies) if 0 in choices and slot.decision is not None else None
+        seen = named_observation(slot.observation, bodies)
+        return Moment(log.index, slot.snapshot, seen, slot.belief, decision, log.steps[-1], None)
 
 
 @kept()

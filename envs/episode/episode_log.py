@@ -9,10 +9,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of
-from mechsearch_jax.envs.episode.records import Episode, Step, record_action
+from mechsearch_jax.envs.episode.numbering import named_action
+from mechsearch_jax.envs.episode.records import ActionRecord, Episode, Step, record_action
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import TARGET, fallen_over
@@ -31,6 +32,8 @@ class Choice(flax.struct.PyTreeNode):
       sequences: number of sequences that it was chosen from.
       refused: number of further sequences whose first action did harm in a trial.
       others: the first actions of all sequences, the best first, of kind NONE after the last; None if not kept.
+      bodies: the number of the body that each object stands for, shape (N,); None if objects have the bodies' numbers.
+      there: whether it stands for that body, shape (N,); None if all do.
     """
 
     action: Action
@@ -39,6 +42,20 @@ class Choice(flax.struct.PyTreeNode):
     sequences: jax.Array
     refused: jax.Array | int = 0
     others: Action | None = None
+    bodies: Int[np.ndarray, " objects"] | None = None
+    there: Bool[np.ndarray, " objects"] | None = None
+
+    @property
+    def executed(self) -> Action:
+        """The action, with the number of a body."""
+        return self.action if self.bodies is None else named_action(self.action, self.bodies)
+
+    @property
+    def recorded(self) -> ActionRecord:
+        """The record of the action, without an object where that stands for no body."""
+        record, index = record_action(self.executed), int(self.action.object)
+        moved = self.there is not None and 0 <= index < len(self.there) and not self.there[index]
+        return dataclasses.replace(record, object=None) if moved else record
 
 
 @kept()
@@ -47,20 +64,6 @@ def chosen(decision: Decision) -> Choice:
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
     others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
     return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused, others)
-
-
-def renumbered(choice: Choice, numbers: Int[np.ndarray, " objects"]) -> Choice:
-    """A choice whose actions name object i by `numbers[i]`; the same choice if that is i for all."""
-    if np.array_equal(numbers, np.arange(len(numbers))):
-        return choice
-
-    def renamed(action: Action) -> Action:
-        index = np.asarray(action.object)
-        moved = np.isin(index, np.arange(len(numbers)))
-        return action.replace(object=np.where(moved, numbers[np.where(moved, index, 0)], index).astype(index.dtype))
-
-    others = None if choice.others is None else renamed(choice.others)
-    return choice.replace(action=renamed(choice.action), others=others)
 
 
 def takes_target(choice: Choice) -> bool:
@@ -158,7 +161,7 @@ def record(
     cost = predicted = action = None
     sequences = 0
     if choice is not None:
-        action, cost = record_action(choice.action), float(choice.cost)
+        action, cost = choice.recorded, float(choice.cost)
         if not takes_target(choice):
             predicted = _expected(choice)
             sequences = int(choice.sequences)
@@ -236,9 +239,7 @@ class EpisodeLog:
 
     def took(self, choice: Choice) -> None:
         """Record that another action was executed than the decided one."""
-        self.steps[-1] = dataclasses.replace(
-            self.steps[-1], action=record_action(choice.action), predicted_cost=_expected(choice)
-        )
+        self.steps[-1] = dataclasses.replace(self.steps[-1], action=choice.recorded, predicted_cost=_expected(choice))
 
     def act(self, result: Result | None, trouble: str | None, timings: dict[str, float]) -> bool:
         """Record the result of the decision; returns whether the episode ends with it.

@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Int
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.belief.belief import without_grasps
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of, truth_unseen
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.episode.slots import BeliefSummary, sizes_and_truths, summary, swept_free_of
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
-from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, scenes_of
@@ -102,8 +102,7 @@ class ManySlots:
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), shapes
         )
-        unseen = Truth(jnp.array(False), jnp.arange(TARGET, dtype=jnp.int32))
-        empty = PlannerState(initial_belief(problem), seen, no_action(), unseen)
+        empty = PlannerState(initial_belief(problem), seen, no_action(), truth_unseen())
         self._state: PlannerState = jax.tree.map(
             lambda a: jax.device_put(np.zeros((self._count, *a.shape), a.dtype)), empty
         )
@@ -174,7 +173,7 @@ class ManySlots:
             self._state = _look(
                 self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
             )
-        return summary(self._problem, self._state.belief, in_base(world, self._sensing), self._state.truth)
+        return summary(self._problem, self._state.belief, self._state.truth, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`.

@@ -19,9 +19,9 @@ class Moment:
     Attributes:
       index: number of actions before it.
       snapshot: what the camera sees.
-      observation: what was recognised.
+      observation: what was recognised, the objects by the numbers of the bodies that they stand for.
       belief: where the target can be.
-      decision: of the policy; None where none was needed or none could be acted upon.
+      decision: of the policy, by the same numbers; None where none was needed or none could be acted upon.
       record: what is written down; its `observed_cost` comes later.
       outcome: what the simulator said of the action; None before it was executed, or without one.
     """

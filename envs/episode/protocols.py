@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.envs.camera.snapshot import Detects, Recogniser, Snapshot
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, detects, is_the_target
 from mechsearch_jax.envs.episode.episode_log import Choice, takes_target
 from mechsearch_jax.envs.episode.slots import Slots
 from mechsearch_jax.envs.episode.verdicts import Verdict
@@ -183,17 +184,23 @@ PROTOCOLS: Mapping[str, EpisodeProtocol] = {"strict": Strict(), "published-code"
 
 @dataclasses.dataclass(frozen=True)
 class WithTruePose:
-    """A `Recogniser` that replaces the pose of a seen target by the true one, as the oracle sees it."""
+    """A `Recogniser` that replaces the pose of a seen target by the true one, as the oracle sees it.
+
+    What is not the target, though a recogniser of images takes it for that, keeps the pose that was recognised.
+    """
 
     inner: Recogniser
 
     @property
     def detects_target(self) -> bool:
         """As of the inner recogniser."""
-        return isinstance(self.inner, Detects) and self.inner.detects_target
+        return detects(self.inner)
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        return self.inner(key, snapshot).replace(target_pose=snapshot.target_pose)
+        seen, true = self.inner(key, snapshot), snapshot.target_pose
+        if not self.detects_target:
+            return seen.replace(target_pose=true)
+        return seen.replace(target_pose=jnp.where(is_the_target(snapshot, seen), true, seen.target_pose))
 
 
 def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:
@@ -203,13 +210,13 @@ def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:
 
 
 def chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, Array]:
-    """The actions of `count` worlds, NONE without a choice, and which worlds have a choice."""
+    """The actions of `count` worlds, by bodies' numbers, NONE without a choice, and which worlds have a choice."""
     actions: Action = jax.tree.map(
         lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action())
     )
     for row, choice in choices.items():
         for name in Action.__dataclass_fields__:
-            getattr(actions, name)[row] = getattr(choice.action, name)
+            getattr(actions, name)[row] = getattr(choice.executed, name)
     return jax.device_put((actions, np.isin(np.arange(count), list(choices))))
 
 

@@ -20,7 +20,8 @@ class ActionRecord:
 
     Attributes:
       kind: name of a registered kind: "push", "pick-and-place", "retrieve", "none", ...
-      object: index of the object in the scenario; None if the action moves no object, for example for a retrieval.
+      object: index of the object in the scenario; None if the action moves no object, for example for a retrieval, or
+        one that was recognised where nothing is.
       T_world_gripper, T_world_place: rows of the 4 x 4 poses [m].
       displacement: [m].
       q7: [rad].

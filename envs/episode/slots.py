@@ -38,8 +38,8 @@ class BeliefSummary:
       size: number of candidate poses where it can be.
       truth: whether it can be at the candidate pose nearest to its true pose.
       restarts: how often f was started anew.
-      shown: whether a target that is found was truly in sight at some look; see `snapshot.Truth`.
-      bodies: of the last look, see `snapshot.Truth`; shape (S, 8).
+      shown: whether what was taken for the target was the target at some look; see `snapshot.Truth`.
+      bodies, there: of the last look, see `snapshot.Truth`; shape (S, 8).
     """
 
     found: Bool[np.ndarray, " slots"]
@@ -48,6 +48,7 @@ class BeliefSummary:
     restarts: Int[np.ndarray, " slots"]
     shown: Bool[np.ndarray, " slots"]
     bodies: Int[np.ndarray, "slots 8"]
+    there: Bool[np.ndarray, "slots 8"]
 
 
 class Slots(Protocol):
@@ -109,7 +110,7 @@ class OneSlot:
       belief: about the target.
       decision: of the policy; None between a look and its decision.
       action: the decision's, to be executed before the next look; of kind NONE before the first.
-      truth: of the last look, and whether the target was in sight at any; None before the first.
+      truth: of the last look, and whether the target was detected at any; None before the first.
     """
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
@@ -155,9 +156,8 @@ class OneSlot:
         truth = truth_of(self._recogniser, snapshot, observation)
         self.truth = truth.replace(shown=truth.shown | shown)
         self.snapshot, self.observation, self.decision = snapshot, observation, None
-        belief: Belief = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief)
-        truth: Truth = jax.tree.map(lambda a: a[None], self.truth)
-        return summary(self._problem, belief, in_base(world, self._sensing), truth)
+        belief, seen = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), (self.belief, self.truth))
+        return summary(self._problem, belief, seen, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -187,10 +187,11 @@ class OneSlot:
         return Snapshot(self._problem.camera, self._problem.shelf, single)
 
 
-def summary(problem: Problem, belief: Belief, world: World, truth: Truth) -> BeliefSummary:
+def summary(problem: Problem, belief: Belief, truth: Truth, world: World) -> BeliefSummary:
     """The beliefs of all slots; all fields, of the world in the base's frame, have a leading axis for them."""
-    size, truth = sizes_and_truths(problem.poses, belief.exists, world)
-    return BeliefSummary(*jax.device_get((belief.found, size, truth, belief.restarts, truth.shown, truth.bodies)))
+    size, possible = sizes_and_truths(problem.poses, belief.exists, world)
+    fields = belief.found, size, possible, belief.restarts, truth.shown, truth.bodies, truth.there
+    return BeliefSummary(*jax.device_get(fields))
 
 
 @kept()

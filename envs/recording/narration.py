@@ -100,6 +100,9 @@ class Narrator:
         if moment.record.found:
             x, y, _ = np.asarray(moment.belief.found_pose)
             target = f"the target at x {x:.3f}, y {y:.3f} m"
+        elif bool(moment.belief.found):
+            x, y, _ = np.asarray(moment.belief.found_pose)
+            target = f"something else at x {x:.3f}, y {y:.3f} m that it takes for the target"
         else:
             target = f"no target; it can be at {moment.record.belief_size} of {len(moment.belief.exists)} poses"
             if (moment.record.restarts or 0) > self._restarts:

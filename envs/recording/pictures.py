@@ -12,8 +12,9 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.envs.camera.simulated_camera import Image
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle, true_target_pose
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle, true_target_pose, truth_of
 from mechsearch_jax.envs.episode.moments import Moment
+from mechsearch_jax.envs.episode.numbering import named_objects
 from mechsearch_jax.envs.recording.recording import RecordedStep
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.planner import Problem
@@ -42,7 +43,9 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         if not kind.takes_target:
             expected = "" if record.predicted_cost is None else f" → {record.predicted_cost:.0f} expected"
             why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"
-    target = "target found" if record.found else f"target can be at {record.belief_size} poses"
+    believed = bool(belief.found)
+    mistaken = "something else is taken for the target" if believed else f"target can be at {record.belief_size} poses"
+    target = "target found" if record.found else mistaken
     outcome = f" · {record.failure}" if record.failure else ""
     outcome += " · an object fell off the board" if record.fallen else ""
     nowhere = np.zeros(problem.poses.shape[0], bool)
@@ -52,7 +55,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         image=colour_image(image),
         owner=np.asarray(image.segmentation),
         scene=objects,
-        existence=nowhere if record.found else np.asarray(belief.exists),
+        existence=nowhere if believed or record.found else np.asarray(belief.exists),
         graspability=np.asarray(planner.graspability_map(problem, belief, moment.observation.objects)),
         target_pose=np.asarray(true_target_pose(moment.snapshot.world)),
         found=record.found,
@@ -95,13 +98,15 @@ def inspect_scenario(
     """
     snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
     # f is shown as if the target were hidden, also where it is not.
-    seen = recogniser(jax.random.key(seed), snapshot).replace(target_visible=jnp.array(False))
+    recognised = recogniser(jax.random.key(seed), snapshot)
+    seen = recognised.replace(target_visible=jnp.array(False))
     belief = planner.update_belief(problem, planner.initial_belief(problem), seen)
+    bodies = np.asarray(truth_of(recogniser, snapshot, recognised).bodies)
     maps = Maps(
         poses=np.asarray(problem.poses),
         existence=np.asarray(belief.exists),
         graspability=np.asarray(planner.graspability_map(problem, belief, seen.objects)),
-        scene=jax.tree.map(np.asarray, seen.objects),
+        scene=jax.tree.map(np.asarray, named_objects(seen.objects, bodies)),
     )
     image = snapshot.image
     figure = maps_figure(

@@ -1,6 +1,6 @@
-"""Detection of the target in a colour and a depth image, by its colour and its known shape.
+"""Detection of the target in a colour and a depth image, by its colour and its known shape and size.
 
-The same on a robot and in simulation: all that is used is the images, the target's colour and its shape.
+The same on a robot and in simulation: all that is used is the images, the target's colour, shape and size.
 """
 
 from __future__ import annotations
@@ -13,38 +13,72 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from mechsearch_jax.images.cloud import MARGIN, above_board, draw
-from mechsearch_jax.images.target_pixels import coloured_pixels, fitted_pose, near_target
-from mechsearch_jax.images.target_pose import distance
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.images.target_evidence import (
+    Evidence,
+    Placement,
+    Sample,
+    away_from,
+    depth_tolerance,
+    evidence,
+    tilted_placements,
+    upright_placements,
+    within_shelf,
+)
+from mechsearch_jax.images.target_pixels import SURFACE, coloured_pixels
+from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Number of points among which the densest place is sought.
-CENTRES = 256
-# How many things of the target's colour are looked at, the one with the densest pixels first.
-PLACES = 3
-# What has the target's colour has its shape, too, if at least this share of its points lies within so many metres of
-# the surface of the fitted target: twice the tolerance for points that are added, since depth may be noisier.
-SHARE_ON_SURFACE, TOLERANCE = 0.7, 0.008
+# Number of points among which the densest place is sought, and to which the target is fitted.
+DRAWN = 256
+# Number of pixels by which placements are compared.
+COMPARED = 1024
+# At how many places of the target's colour the target is sought, the one with the densest pixels first.
+PLACES = 16
+# Radius of a place, and of the part of it that is not a place again, relative to the diagonal of the target.
+PLACE, PASSED = 0.6, 0.25
+# The target is where at least this share of the evidence is for it.
+SHARE = 0.85
+# Pixels of the target's colour up to this far from its surface are its own, such as those across its edges [m].
+OWN = 0.012
+
+
+class ColouredDepth(flax.struct.PyTreeNode):
+    """A depth image with colours.
+
+    Attributes:
+      points: in the world [m], shape (h, w, 3); NaN where nothing was measured.
+      depth: of the points [m], shape (h, w); NaN where nothing was measured, infinite where there is nothing.
+      colour: red, green and blue in 0 to 1, shape (h, w, 3).
+    """
+
+    points: jax.Array
+    depth: jax.Array
+    colour: jax.Array
 
 
 class Detection(flax.struct.PyTreeNode):
     """The target in an image.
 
     Attributes:
-      coloured: pixels of the target's colour that can be one target's, bool, shape (h, w).
-      pixels: these and, if it is visible, what lies on the surface of the fitted target, bool, shape (h, w).
-      visible: whether more pixels than the threshold are `coloured`.
+      visible: whether it is there, in more pixels than the threshold.
+      coloured: its pixels of its colour, bool, shape (h, w).
+      pixels: these, and the others on the surface of an upright target; none if it is not visible.
+      unclear: pixels of its colour where too few show to tell what they are; they may be the target's.
+      share: of the evidence at the last place that is for the target; 0 where nothing has its colour.
     """
 
+    visible: jax.Array
     coloured: jax.Array
     pixels: jax.Array
-    visible: jax.Array
+    unclear: jax.Array
+    share: jax.Array
 
 
 def no_detection(image: Float[Array, "h w"]) -> Detection:
     """The detection in an image of this shape that shows no target."""
-    return Detection(jnp.zeros(image.shape, bool), jnp.zeros(image.shape, bool), jnp.zeros((), bool))
+    nowhere = jnp.zeros(image.shape, bool)
+    return Detection(jnp.zeros((), bool), nowhere, nowhere, nowhere, jnp.zeros(()))
 
 
 def detect(
@@ -53,70 +87,113 @@ def detect(
     target: Target,
     shelf: Shelf,
     camera: Camera,
-    points: Float[Array, "h w 3"],
-    depth: Float[Array, "h w"],
-    colour: Float[Array, "h w 3"],
+    image: ColouredDepth,
     threshold: float,
 ) -> Detection:
     """Find the target's pixels.
 
-    Pixels of the target's colour are gathered at their densest place: those that are farther away than the target is
-    large are something else's. They are the target if they are more than the threshold and have its shape; else the
-    next densest place is looked at, up to `PLACES` of them.
+    The target is fitted to the pixels of its colour where they are densest, first upright, then leaning or lying. It
+    is there if at least `SHARE` of the evidence is for it (`target_evidence.evidence`): if it is seen on its whole
+    surface that nothing hides, and nothing of its colour goes on beyond it. Else the next densest place is looked at,
+    up to `PLACES` of them.
 
     Args:
       key: PRNG key of the drawn points.
       detector: gives the pixels of the target's colour in a colour image.
       target: whose size and shape are known; static.
       shelf, camera: of the image.
-      points: in the world [m]; NaN where nothing was measured.
-      depth: of the points [m].
-      colour: red, green and blue in 0 to 1.
+      image: of the shelf.
       threshold: a target of at most this many pixels is not visible.
     """
     # Points on the board's faces may be the target's.
-    near = above_board(shelf, points, -MARGIN)
-    left = coloured_pixels(detector, colour, depth) & near
-    chosen, on_it, visible = jnp.zeros(depth.shape, bool), jnp.zeros(depth.shape, bool), jnp.zeros((), bool)
-    for place in range(PLACES):
-        place_key = jax.random.fold_in(key, place)
-        here = in_one_place(place_key, target, points, left)
-        pose, _ = fitted_pose(place_key, target, shelf, camera, points, here)
-        enough = jnp.sum(here) > threshold
-        fits = enough & has_shape(target, shelf, pose, points, here) & ~visible
-        # Where too little shows to tell, nothing is an object.
-        unclear = ~enough if place == 0 else jnp.zeros((), bool)
-        chosen |= here & (fits | unclear)
-        on_it |= near_target(target, shelf, pose, points) & near & fits
-        visible, left = visible | fits, left & ~here
-    # The pose is unreliable if it would add more pixels than the colour shows.
-    on_it &= jnp.sum(on_it & ~chosen) <= jnp.sum(chosen)
-    return Detection(chosen, chosen | on_it, visible)
+    near = above_board(shelf, image.points, -MARGIN)
+    coloured = coloured_pixels(detector, image.colour, image.depth) & near
+    tolerance = jnp.broadcast_to(depth_tolerance(image.depth, coloured), coloured.shape)
+    sample = Sample(rays(camera), image.points, image.depth, coloured, tolerance)
+    scene = _Scene(sample, near, jnp.array(camera.position), shelf, threshold)
+
+    def goes_on(state):
+        place, left, found = state
+        return (place < PLACES) & ~found.visible & jnp.any(left)
+
+    def look(state):
+        place, left, found = state
+        at = densest_place(jax.random.fold_in(key, place), target, image.points, left)
+        apart = jnp.sum((image.points - at.reshape(1, 1, 3)) ** 2, axis=-1) / _diagonal(target) ** 2
+        within = apart < PLACE**2
+        seen = _at_place(jax.random.fold_in(key, PLACES + place), target, scene, at, left & within)
+        few = coloured & within & (jnp.sum(coloured & within) <= threshold)
+        seen = seen.replace(unclear=(found.unclear | few) & ~seen.visible)
+        return place + 1, left & ~(apart < PASSED**2) & ~few, seen
+
+    return jax.lax.while_loop(goes_on, look, (jnp.int32(0), coloured, no_detection(image.depth)))[2]
 
 
-def in_one_place(
+class _Scene(flax.struct.PyTreeNode):
+    """What is the same at every place: the pixels, which are near the shelf's space, the camera's position, ..."""
+
+    sample: Sample
+    near: jax.Array
+    origin: jax.Array
+    shelf: Shelf
+    threshold: jax.Array | float
+
+
+def _diagonal(target: Target) -> float:
+    """Of the box around the target [m]."""
+    return 2.0 * float(sum(half**2 for half in target.half_size)) ** 0.5
+
+
+def densest_place(
     key: Key[Array, ""], target: Target, points: Float[Array, "h w 3"], coloured: Bool[Array, "h w"]
-) -> Bool[Array, "h w"]:
-    """The pixels that can show one target: no farther from the densest place than it is large.
+) -> Float[Array, " 3"]:
+    """The point around which most pixels are as near as one target's can be [m].
 
     Args:
       key: PRNG key of the drawn points.
       target: whose size is known; static.
       points: in the world [m].
-      coloured: pixels that may be the target's.
+      coloured: pixels that may be the target's; if there are none, the point is meaningless.
     """
-    index, _ = draw(jax.random.fold_in(key, 1), coloured.reshape(-1), CENTRES)
+    index, _ = draw(key, coloured.reshape(-1), DRAWN)
     drawn = points.reshape(-1, 3)[index]
-    # The box around the target has this diagonal.
-    extent = 2.0 * float(sum(half**2 for half in target.half_size)) ** 0.5
     square = sum((drawn[:, None, i] - drawn[None, :, i]) ** 2 for i in range(3))
-    densest = drawn[jnp.argmax(jnp.sum(square < (0.5 * extent) ** 2, axis=1))]
-    return coloured & (jnp.sum((points - densest.reshape(1, 1, 3)) ** 2, axis=-1) < extent**2)
+    return drawn[jnp.argmax(jnp.sum(square < (0.5 * _diagonal(target)) ** 2, axis=1))]
 
 
-def has_shape(
-    target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "h w 3"], pixels: Bool[Array, "h w"]
-) -> Bool[Array, ""]:
-    """Whether pixels lie on the surface of the target at a pose x, y [m] and yaw [rad], but for `SHARE_ON_SURFACE`."""
-    away = jnp.abs(distance(target, shelf, pose, points.reshape(-1, 3))).reshape(pixels.shape)
-    return jnp.sum(pixels & (away < TOLERANCE)) >= SHARE_ON_SURFACE * jnp.sum(pixels)
+def _at_place(
+    key: Key[Array, ""], target: Target, scene: _Scene, at: Float[Array, " 3"], here: Bool[Array, "h w"]
+) -> Detection:
+    """What is detected at a place, whose middle [m] and pixels are given."""
+    sample, shelf, origin = scene.sample, scene.shelf, scene.origin
+    fit_key, compare_key = jax.random.split(key)
+    flat = jax.tree.map(lambda a: a.reshape(here.size, *a.shape[2:]), sample)
+    index, count = draw(fit_key, here.reshape(-1), DRAWN)
+    drawn, valid = flat.points[index], jnp.broadcast_to(count > 0, DRAWN)
+    # Rays that may meet a target near the place.
+    towards = (at - origin).reshape(1, 3)
+    reach = jnp.sum(flat.rays * towards, axis=-1, keepdims=True) / jnp.sum(flat.rays**2, axis=-1, keepdims=True)
+    passes = jnp.sum((reach * flat.rays - towards) ** 2, axis=-1) < _diagonal(target) ** 2
+    region, _ = draw(compare_key, passes, COMPARED)
+    compared: Sample = jax.tree.map(lambda a: a[region], flat)
+
+    def best(placements: Placement) -> tuple[Placement, Evidence]:
+        each = jax.vmap(lambda placement: evidence(target, placement, origin, compared))(placements)
+        possible = jax.vmap(lambda placement: within_shelf(target, placement, shelf))(placements)
+        worth = jnp.where(possible, each.support - each.contrary, -2 * COMPARED)
+        chosen = jax.tree.map(lambda a: a[jnp.argmax(worth)], placements)
+        return chosen, evidence(target, chosen, origin, flat)
+
+    placement, proof = best(upright_placements(target, shelf, origin, drawn, valid))
+    stands = proof.share >= SHARE
+    placement, proof = jax.lax.cond(
+        stands, lambda: (placement, proof), lambda: best(tilted_placements(target, origin, drawn, valid))
+    )
+    away = jnp.abs(away_from(target, placement, flat.points)).reshape(here.shape)
+    own = sample.coloured & (away < OWN)
+    enough = jnp.sum(own) > scene.threshold
+    visible = enough & (proof.share >= SHARE) & within_shelf(target, placement, shelf)
+    # The pose is unreliable if it would add more pixels than the colour shows.
+    on_it = (away < SURFACE) & scene.near & stands
+    on_it &= jnp.sum(on_it & ~own) <= jnp.sum(own)
+    return Detection(visible, own & visible, (own | on_it) & visible, jnp.zeros(here.shape, bool), proof.share)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +38,23 @@ def _cost(residual, weight):
     return jnp.sum(weight * jnp.where(size < OUTLIER, 0.5 * size**2, OUTLIER * (size - 0.5 * OUTLIER)))
 
 
-def _descend(residuals, weight, start):
-    """Damped Gauss-Newton from a start; a step is kept only if it lowers the cost."""
+def descend(
+    residuals: Callable[[Array], Array],
+    weight: Float[Array, " p"],
+    start: Float[Array, " n"],
+    longest: tuple[float, ...] = LONGEST_STEP,
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Robust damped Gauss-Newton from a start; a step is kept only if it lowers the cost.
+
+    Args:
+      residuals: of P points at a pose of N numbers [m].
+      weight: of the points.
+      start: the first pose.
+      longest: step in each of its numbers.
+
+    Returns:
+      The last pose, and its cost.
+    """
 
     def step(state, _):
         pose, cost, damping = state
@@ -49,7 +65,7 @@ def _descend(residuals, weight, start):
         scale = jnp.diag(JtJ)
         # Directions that the points do not determine, such as the yaw of a round target, do not change.
         H = JtJ + jnp.diag(damping * scale + jnp.where(scale > 0, 1e-9, 1.0))
-        move = jnp.clip(-jnp.linalg.solve(H, gradient), -jnp.array(LONGEST_STEP), jnp.array(LONGEST_STEP))
+        move = jnp.clip(-jnp.linalg.solve(H, gradient), -jnp.array(longest), jnp.array(longest))
         trial = pose + move
         trial_cost = _cost(residuals(trial), weight)
         better = trial_cost < cost
@@ -96,6 +112,6 @@ def target_pose(
     yaws = jnp.zeros(1) if is_round else jnp.arange(8) * (math.pi / 8)
     starts = jnp.concatenate([jnp.broadcast_to(xy[None], (len(yaws), 2)), yaws[:, None]], axis=1)
     residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
-    poses, costs = jax.vmap(lambda start: _descend(residuals, weight, start))(starts)
+    poses, costs = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
     best = poses[jnp.argmin(costs)]
     return best.at[2].set(0.0 if is_round else jnp.mod(best[2], math.pi))

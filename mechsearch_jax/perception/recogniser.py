@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.images.detection import detect, no_detection
+from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
@@ -205,17 +205,16 @@ def _labelled(
     if colour is not None:
         pixels = view.of(jnp.asarray(colour))
         scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
-        pixels = pixels.astype(jnp.float32) / scale
-        detection = detect(
-            key, recogniser.detector, recogniser.target, shelf, view.camera, points, seen, pixels, threshold
-        )
+        image = ColouredDepth(points, seen, pixels.astype(jnp.float32) / scale)
+        detection = detect(key, recogniser.detector, recogniser.target, shelf, view.camera, image, threshold)
     visible = detection.visible
     if mask is None:
         of_target = detection.pixels
-        labels = recogniser.segmenter(key, shelf, points, of_target)
+        # As objects, small segments would rule out the pose of a target that is not detected.
+        labels = recogniser.segmenter(key, shelf, points, of_target | detection.unclear)
     else:
         instances = _instances(view.of(jnp.asarray(mask)))
-        of_target, freed = _target_in(instances, detection.coloured, target_id)
+        of_target, freed = _target_in(instances, detection.coloured | detection.unclear, target_id)
         of_target &= near
         labels = _labels(instances, freed, shelf, points)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
