@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
+from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
@@ -169,3 +170,34 @@ grab = Grab()
 def idle(key, problem, belief, observation):
     """Sees no action that is possible, not even taking the target out."""
     return grab(key, problem, belief, observation).replace(action=no_action())
+
+
+@dataclasses.dataclass(frozen=True)
+class Shuffled:
+    """A recogniser that detects the target by itself, and numbers the objects of another in an order of its own.
+
+    Attributes:
+      order: the number in `inner` of each object.
+      inner: the other recogniser.
+    """
+
+    order: tuple[int, ...]
+    inner: Recogniser = oracle
+    detects_target: bool = True
+
+    def __call__(self, key, snapshot):
+        seen = self.inner(key, snapshot)
+        return seen.replace(objects=jax.tree.map(lambda a: a[np.array(self.order)], seen.objects))
+
+
+def grab_nearest(key, problem, belief, observation):
+    """`grab`, but the object that is nearest to the robot is pushed, whatever its number."""
+    x = jnp.where(observation.objects.valid, observation.objects.position[:, 0], jnp.inf)
+    decision = grab(key, problem, belief, observation)
+    pushes = decision.action.kind == ActionKind.PUSH
+    index = jnp.argmin(x).astype(jnp.int32)
+    actions = decision.sequences.actions
+    return decision.replace(
+        action=decision.action.replace(object=jnp.where(pushes, index, decision.action.object)),
+        sequences=decision.sequences.replace(actions=actions.replace(object=jnp.full((1, 1), index))),
+    )

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, idle, push_off, reveal, topple
+from stage import HIDDEN, OPEN, TWO, Grab, Shuffled, Stage, grab, grab_nearest, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
-from mechsearch_jax.envs.camera.snapshot import informed
+from mechsearch_jax.envs.camera.snapshot import informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
@@ -89,6 +89,20 @@ def test_an_informed_planner_knows_a_hidden_target_in_a_batch_as_alone(problem):
         alone = run_episode(Start(scenario, 0), problem, grab, Stage(reveal), settings)
         assert without_times(episodes[i]) == without_times(alone)
         assert (alone.found_step, alone.retrieved) == (0, True)
+
+
+def test_objects_in_any_order_give_the_same_episodes_in_a_batch(problem):
+    """In every slot the simulator and the records name the bodies that the recognised objects stand for."""
+    scenarios, by_order = [TWO, HIDDEN, TWO], []
+    for recogniser in (oracle, Shuffled((1, 7, 0, 2, 3, 4, 5, 6))):
+        episodes, stage = {}, Stage({"hidden": reveal})
+        settings = RunSettings(recogniser, max_steps=2, at_once=AT_ONCE)
+        starts = [Start(s, seed) for seed, s in enumerate(scenarios)]
+        run_episodes(starts, problem, grab_nearest, stage, 2, Listeners(episodes.update), settings)
+        by_order.append([without_times(episodes[i]) for i in range(3)])
+        assert {int(action.object) for action in stage.actions} == {0}
+    assert by_order[0] == by_order[1]
+    assert by_order[1][1]["retrieved"]
 
 
 class Counting(Grab):

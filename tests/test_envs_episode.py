@@ -8,12 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, push_off, reveal, topple
+from stage import (
+    BOX,
+    CYLINDER,
+    HIDDEN,
+    OPEN,
+    TWO,
+    UPRIGHT,
+    Shuffled,
+    Stage,
+    grab,
+    grab_nearest,
+    idle,
+    push_off,
+    reveal,
+    topple,
+)
 
-from mechsearch_jax.actions import ActionKind, kind_of
+from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, nearest_bodies, oracle, truth_of
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle, truth_of
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -111,37 +126,6 @@ def test_a_detected_target_counts_as_found_once_it_is_truly_in_sight(problem):
     assert first.belief_size == 1
     blind = run(problem, HIDDEN, Stage(), recogniser=Hasty())
     assert (blind.found_step, blind.failure) == (None, "not found")
-
-
-@dataclasses.dataclass(frozen=True)
-class Shuffled:
-    """A recogniser that detects the target by itself, and numbers the objects of another in an order of its own.
-
-    Attributes:
-      order: the number in `inner` of each object.
-      inner: the other recogniser.
-    """
-
-    order: tuple[int, ...]
-    inner: Recogniser = oracle
-    detects_target: bool = True
-
-    def __call__(self, key, snapshot):
-        seen = self.inner(key, snapshot)
-        return seen.replace(objects=jax.tree.map(lambda a: a[np.array(self.order)], seen.objects))
-
-
-def grab_nearest(key, problem, belief, observation):
-    """`grab`, but the object that is nearest to the robot is pushed, whatever its number."""
-    x = jnp.where(observation.objects.valid, observation.objects.position[:, 0], jnp.inf)
-    decision = grab(key, problem, belief, observation)
-    pushes = decision.action.kind == ActionKind.PUSH
-    index = jnp.argmin(x).astype(jnp.int32)
-    actions = decision.sequences.actions
-    return decision.replace(
-        action=decision.action.replace(object=jnp.where(pushes, index, decision.action.object)),
-        sequences=decision.sequences.replace(actions=actions.replace(object=jnp.full((1, 1), index))),
-    )
 
 
 def test_objects_are_named_after_the_nearest_bodies(problem):

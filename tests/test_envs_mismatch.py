@@ -197,7 +197,7 @@ def test_exposure_and_noise_of_colour_are_as_given():
         assert seen.max() <= 1.0
         np.testing.assert_allclose(255 * seen, np.round(255 * seen), atol=1e-4)
         balance = 1.0 + mismatch.white_balance * np.array([1.0, 0.0, -1.0])
-        expected = mismatch.exposure * balance * plain
+        expected = mismatch.exposure * balance * np.asarray(plain)
         inside = (expected > 0.2) & (expected < 0.8)
         error = (seen - expected)[inside]
         assert np.mean(error) == pytest.approx(0.0, abs=2e-4)

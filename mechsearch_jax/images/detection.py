@@ -33,6 +33,8 @@ from mechsearch_jax.workspace.target import Target
 DRAWN = 256
 # Number of pixels by which placements are compared.
 COMPARED = 1024
+# Where less than this share of the evidence in more than so many of these pixels is for it, no others are asked.
+HOPELESS, LEAST_COMPARED = 0.5, 50
 # At how many places of the target's colour the target is sought, the one with the densest pixels first.
 PLACES = 16
 # Radius of a place, and of the part of it that is not a place again, relative to the diagonal of the target.
@@ -181,8 +183,9 @@ def _at_place(
         each = jax.vmap(lambda placement: evidence(target, placement, origin, compared))(placements)
         possible = jax.vmap(lambda placement: within_shelf(target, placement, shelf))(placements)
         worth = jnp.where(possible, each.support - each.contrary, -2 * COMPARED)
-        chosen = jax.tree.map(lambda a: a[jnp.argmax(worth)], placements)
-        return chosen, evidence(target, chosen, origin, flat)
+        chosen, rough = jax.tree.map(lambda a: a[jnp.argmax(worth)], (placements, each))
+        hopeless = (rough.share < HOPELESS) & (rough.support + rough.contrary > LEAST_COMPARED)
+        return chosen, jax.lax.cond(hopeless, lambda: rough, lambda: evidence(target, chosen, origin, flat))
 
     placement, proof = best(upright_placements(target, shelf, origin, drawn, valid))
     stands = proof.share >= SHARE
