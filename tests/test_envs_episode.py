@@ -28,7 +28,7 @@ from stage import (
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle, truth_of
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle, truth_of, truth_unseen
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -39,6 +39,7 @@ from mechsearch_jax.envs.recording.pictures import frame
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.runtime.errors import InputError
@@ -159,6 +160,15 @@ def test_the_sum_of_distances_decides_which_body_an_object_stands_for(problem):
     bodies, there = nearest_bodies(world, seen.objects.replace(position=seen.objects.position.at[:3].set(y)))
     np.testing.assert_array_equal(bodies[:3], [1, 0, 2])
     assert np.asarray(there)[:3].all()
+
+
+@pytest.mark.parametrize("visible", [True, False])
+@pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize("now", [True, False])
+def test_what_is_taken_for_the_target_last_is_what_counts(visible, before, now):
+    observation = Observation(empty(8), jnp.array(visible), jnp.zeros(3))
+    truth = truth_unseen(shown=now and visible).since(truth_unseen(shown=before), observation)
+    assert bool(truth.shown) == ((now and visible) if visible else before)
 
 
 def test_a_detection_is_the_target_only_where_the_target_is_in_sight(problem):

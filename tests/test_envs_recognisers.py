@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.benchmarks.parts.segmentation import numbered
+from mechsearch_jax.envs.camera import recognisers
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
 from mechsearch_jax.envs.camera.recognisers import detected, large_segments, recogniser, true_labels
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
@@ -187,6 +188,26 @@ def test_full_asks_the_truth_for_nothing(world):
     jax.eval_shape(lambda here: full(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
     with pytest.raises(AssertionError, match="in sight"):
         jax.eval_shape(lambda here: masks(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
+
+
+def test_full_sees_the_same_whatever_the_true_segments_are(world, monkeypatch):
+    def scrambled(*arguments):
+        image = observe(*arguments)
+        return image.replace(segmentation=jnp.zeros_like(image.segmentation) + 3)
+
+    view, keys = thinned_view(CAMERA, SHELF), jax.random.split(jax.random.key(0))
+    plain = moved(world, TARGET, [SCENE.target.position[0], -0.06, SCENE.target.position[2]])
+    unseen = found_pixels(CAMERA) / view.stride**2
+
+    def look():
+        # Another segmenter is compiled anew.
+        full = dataclasses.replace(recogniser("full", target_of(SCENE)), segmenter=Curious())
+        return detected(keys, full, view, SHELF, plain, unseen)
+
+    true = look()
+    monkeypatch.setattr(recognisers, "observe", scrambled)
+    assert bool(true[1])
+    jax.tree.map(np.testing.assert_array_equal, look(), true)
 
 
 def test_colours_belong_to_the_scene_and_keep_away_from_the_targets(world):

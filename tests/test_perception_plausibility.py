@@ -20,6 +20,7 @@ from mechsearch_jax.perception.plausibility import (
     NOTHING_MEASURED,
     check_measured,
     colour_faults,
+    detection_faults,
     identity_faults,
     image_faults,
     sight_faults,
@@ -95,6 +96,20 @@ def test_no_published_scene_is_said_to_be_wrong():
         depth, colour = sensed(scene)
         assert image_faults(CAMERA, SHELF, depth) == ()
         assert colour_faults(CAMERA, SHELF, TARGET, TargetColour.lit(), depth, colour) == ()
+
+
+def unseen(visible=False):
+    return Observation(empty(8), jnp.array(visible), jnp.zeros(3))
+
+
+def test_things_of_the_targets_colour_that_are_not_the_target_are_said():
+    depth, colour = sensed(IN_SIGHT)
+    red, blue = TargetColour.lit(), TargetColour.lit((0.0, 0.0, 0.8))
+    (fault,) = detection_faults(CAMERA, SHELF, red, depth, colour, unseen())
+    assert "pixels have the target's colour, but nothing that shows them has its shape and size" in fault
+    assert detection_faults(CAMERA, SHELF, red, depth, colour, unseen(visible=True)) == ()
+    assert detection_faults(CAMERA, SHELF, red, *sensed(SCENE), unseen()) == ()
+    assert len(detection_faults(CAMERA, SHELF, blue, depth, colour[..., ::-1], unseen())) == 1
 
 
 def test_blue_green_red_is_said():

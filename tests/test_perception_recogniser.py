@@ -130,6 +130,14 @@ def test_the_last_instance_takes_the_slot_of_a_target_with_another_number(see, i
     assert same(seen, named)
 
 
+def test_colour_alone_tells_which_object_of_a_mask_is_the_target(images, in_sight, named):
+    """Also where the target is a little larger than it is said to be."""
+    small = types.SimpleNamespace(camera=images.camera, shelf=Shelf(), target=Target("cylinder", (0.017, 0.017, 0.043)))
+    seen = Recogniser(small)(KEY, in_sight.depth, in_sight.colour, in_sight.mask)
+    assert seen.target_visible
+    np.testing.assert_allclose(seen.target_pose[:2], named.target_pose[:2], atol=0.01)
+
+
 def test_a_mask_that_does_not_show_the_target(see, in_sight, masked):
     unnumbered = np.where(in_sight.mask == TARGET, OTHER, in_sight.mask)
     seen = see(KEY, in_sight.depth, mask=unnumbered, target_id=-1)

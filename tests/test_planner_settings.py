@@ -125,6 +125,7 @@ def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_pa
 WRONG = {
     "[target]\ncolor = [255, 0, 0]": ":2: [target] color (255.0, 0.0, 0.0) must be red, green and blue, each",
     "[target]\n\ncolor = [1, 1, 1]": ":3: [target] color (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
+    "[target]\ncolor = {hue = 40, saturation = 0.1}": ":2: [target] color saturation 0.1 is too grey",
     "[target]\ncolor = {hue = 400, saturation = 1}": ":2: [target] color: hue (400.0) must be from 0 to 360 degrees",
     "[target]\ncolor = {hue = 40}": ":2: [target] color must be red, green and blue, or {hue = DEGREES",
     "[target]\nhue_tolerance = 90": ":2: [target] hue_tolerance (90.0) must be from 1 to 60 degrees",

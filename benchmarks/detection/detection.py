@@ -1,4 +1,4 @@
-"""How well the target is detected in simulated depth and colour images, in any light.
+"""How well the target is detected in simulated depth and colour images, in dim, bright and tinted light.
 
 Every scenario is looked at as it stands, where its target mostly hides, and with the target at random free places.
 """

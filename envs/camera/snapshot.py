@@ -25,6 +25,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 # What is recognised farther than this from a body stands for another one, or for none [m].
 NEAR = 0.1
+# What is taken for the target farther than this from it is something else: a target's width and a half [m].
+NEAR_TARGET = 0.03
 
 
 class Sight(flax.struct.PyTreeNode):
@@ -116,7 +118,7 @@ class Truth(flax.struct.PyTreeNode):
     """What a look truly shows, for verdicts and records; the planner does not know it.
 
     Attributes:
-      shown: whether what is taken for the target is the target, and in sight, or comes from the truth anyway.
+      shown: whether what was taken for the target last was the target, in sight, or came from the truth anyway.
       bodies: the number of the body that each recognised object stands for, each number once, int32, shape (8,).
       there: whether it stands for that body; one that stands for none has the number of an empty slot, if there is
         one, shape (8,).
@@ -125,6 +127,10 @@ class Truth(flax.struct.PyTreeNode):
     shown: jax.Array
     bodies: jax.Array
     there: jax.Array
+
+    def since(self, before: Truth, observation: Observation) -> Truth:
+        """The truth of this look after earlier ones: where nothing is taken for the target, `shown` stays."""
+        return self.replace(shown=jnp.where(observation.target_visible, self.shown, self.shown | before.shown))
 
 
 def truth_of(recogniser: Recogniser, snapshot: Snapshot, observation: Observation) -> Truth:
@@ -151,7 +157,7 @@ def detects(recogniser: Recogniser) -> bool:
 def is_the_target(snapshot: Snapshot, observation: Observation) -> Bool[Array, ""]:
     """Whether the target is detected where it is, and truly in sight."""
     apart = observation.target_pose[:2] - snapshot.target_pose[:2]
-    return observation.target_visible & snapshot.target_seen & (jnp.sum(apart**2) < NEAR**2)
+    return observation.target_visible & snapshot.target_seen & (jnp.sum(apart**2) < NEAR_TARGET**2)
 
 
 @kept()

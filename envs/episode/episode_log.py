@@ -54,8 +54,8 @@ class Choice(flax.struct.PyTreeNode):
     def recorded(self) -> ActionRecord:
         """The record of the action, without an object where that stands for no body."""
         record, index = record_action(self.executed), int(self.action.object)
-        moved = self.there is not None and 0 <= index < len(self.there) and not self.there[index]
-        return dataclasses.replace(record, object=None) if moved else record
+        is_phantom = self.there is not None and 0 <= index < len(self.there) and not self.there[index]
+        return dataclasses.replace(record, object=None) if is_phantom else record
 
 
 @kept()

@@ -313,7 +313,7 @@ def _look(
         observation = recogniser(key, snapshot)
         belief = update_belief(problem, slot_state.belief, observation, slot_state.observation, slot_state.action)
         truth = truth_of(recogniser, snapshot, observation)
-        truth = truth.replace(shown=truth.shown | slot_state.truth.shown)
+        truth = truth.since(slot_state.truth, observation)
         return PlannerState(belief, observation, no_action(), truth)
 
     new = jax.vmap(look)(

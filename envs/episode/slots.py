@@ -38,7 +38,7 @@ class BeliefSummary:
       size: number of candidate poses where it can be.
       truth: whether it can be at the candidate pose nearest to its true pose.
       restarts: how often f was started anew.
-      shown: whether what was taken for the target was the target at some look; see `snapshot.Truth`.
+      shown: whether what was taken for the target last was the target; see `snapshot.Truth`.
       bodies, there: of the last look, see `snapshot.Truth`; shape (S, 8).
     """
 
@@ -152,9 +152,8 @@ class OneSlot:
         before = observation if self.observation is None else self.observation
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
         self.action = no_action()
-        shown = self.truth is not None and self.truth.shown
         truth = truth_of(self._recogniser, snapshot, observation)
-        self.truth = truth.replace(shown=truth.shown | shown)
+        self.truth = truth if self.truth is None else truth.since(self.truth, observation)
         self.snapshot, self.observation, self.decision = snapshot, observation, None
         belief, seen = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), (self.belief, self.truth))
         return summary(self._problem, belief, seen, in_base(world, self._sensing))

@@ -21,6 +21,7 @@ from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, project
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -302,6 +303,41 @@ def colour_faults(
     return (
         "colour image: looks like blue, green, red: nothing has the target's colour, but with red and blue exchanged "
         "something of the target's shape has; give red, green, blue",
+    )
+
+
+def detection_faults(
+    camera: Camera,
+    shelf: Shelf,
+    detector: Callable[[jax.Array], jax.Array],
+    depth: Float[np.ndarray, "h w"],
+    colour: np.ndarray,
+    observation: Observation,
+) -> tuple[str, ...]:
+    """A warning if things have the target's colour, and none of them is taken for the target.
+
+    Args:
+      camera, shelf, detector, depth, colour: as in `colour_faults`.
+      observation: of these images, without batch axes.
+    """
+    if bool(observation.target_visible):
+        return ()
+    view = thinned_view(camera, shelf)
+    seen = np.asarray(view.of(jnp.asarray(depth, jnp.float32)))
+    seen = jnp.asarray(np.where(seen > 0, seen, np.nan))
+    pixels = np.asarray(view.of(jnp.asarray(colour)))
+    image = jnp.asarray(pixels.astype(np.float32) / (255.0 if pixels.dtype == np.uint8 else 1.0))
+    inside = above_board(shelf, back_project(view.camera, seen))
+    least = found_pixels(camera) / view.stride**2
+    # The vote among neighbours is slow, and needless where next to nothing has the colour.
+    if not bool(jnp.sum(detector(image) & inside) > least):
+        return ()
+    count = int(jnp.sum(coloured_pixels(detector, image, seen) & inside))
+    if count <= least:
+        return ()
+    return (
+        f"colour image: {count * view.stride**2} pixels have the target's colour, but nothing that shows them has its "
+        "shape and size; if the target is among them, check [target] and the camera's pose",
     )
 
 

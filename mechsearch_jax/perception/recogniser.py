@@ -20,6 +20,7 @@ from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thi
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
@@ -201,20 +202,25 @@ def _labelled(
     # Points on the board's faces may be the target's.
     near = above_board(shelf, points, -MARGIN)
     threshold = found_pixels(camera) / view.stride**2
-    detection = no_detection(seen)
+    image = None
     if colour is not None:
         pixels = view.of(jnp.asarray(colour))
         scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
         image = ColouredDepth(points, seen, pixels.astype(jnp.float32) / scale)
-        detection = detect(key, recogniser.detector, recogniser.target, shelf, view.camera, image, threshold)
-    visible = detection.visible
     if mask is None:
-        of_target = detection.pixels
+        detection = no_detection(seen)
+        if image is not None:
+            detection = detect(key, recogniser.detector, recogniser.target, shelf, view.camera, image, threshold)
+        visible, of_target = detection.visible, detection.pixels
         # As objects, small segments would rule out the pose of a target that is not detected.
         labels = recogniser.segmenter(key, shelf, points, of_target | detection.unclear)
     else:
         instances = _instances(view.of(jnp.asarray(mask)))
-        of_target, freed = _target_in(instances, detection.coloured | detection.unclear, target_id)
+        # The mask says what is one thing, so its colour alone tells the target from the others.
+        coloured = jnp.zeros(seen.shape, bool)
+        if image is not None:
+            coloured = coloured_pixels(recogniser.detector, image.colour, seen) & near
+        of_target, freed = _target_in(instances, coloured, target_id)
         of_target &= near
         labels = _labels(instances, freed, shelf, points)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)

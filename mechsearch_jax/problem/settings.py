@@ -10,7 +10,7 @@ from typing import Any, Literal
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import OPTIONS, Config, Option
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
-from mechsearch_jax.images.colour import HUE, RED, TargetColour, rgb_of_hue
+from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
@@ -176,6 +176,11 @@ def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
     if value.keys() != {"hue", "saturation"}:
         raise InputError(f"{where} must be red, green and blue, or {{hue = DEGREES, saturation = SHARE}}")
     hue, saturation = (checked(value[name], float, f"{where} {name}") for name in ("hue", "saturation"))
+    if saturation < LEAST_TARGET_SATURATION:
+        raise InputError(
+            f"{where} saturation {saturation:g} is too grey to tell the target by; give at least "
+            f"{LEAST_TARGET_SATURATION:g}, or a mask with the images"
+        )
     return apply(
         document, "target", {COLOR: (hue, saturation)}, lambda numbers: rgb_of_hue(*numbers.get(COLOR, (0.0, 1.0)))
     )

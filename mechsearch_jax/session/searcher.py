@@ -39,6 +39,7 @@ from mechsearch_jax.perception.plausibility import (
     EMPTY_SHELF,
     check_measured,
     colour_faults,
+    detection_faults,
     identity_faults,
     image_faults,
     sight_faults,
@@ -290,7 +291,7 @@ class Searcher:
         width = None if width is None else checked_width(width, problem.gripper.max_opening)
         misplaced = self._placement_faults(depth)
         observation = self.recogniser(recognition_key, depth, colour, mask, target_id)
-        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id)]
+        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
         unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
         warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
         last = (now.observation, now.action) if now.acted else (None, None)
@@ -423,8 +424,10 @@ class Searcher:
         check_measured(camera, shelf, depth)
         return placement_faults(camera, shelf, depth, self.workcell.calibration)
 
-    def _faults(self, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None) -> list[str]:
-        """Warnings about images that do not fit camera, shelf and target."""
+    def _faults(
+        self, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None, observation: Observation
+    ) -> list[str]:
+        """Warnings about images that do not fit camera, shelf and target; the observation is of them."""
         problem, recogniser = self.problem, self.recogniser
         mask, colour = (None if image is None else np.asarray(image) for image in (mask, colour))
         faults = list(image_faults(problem.camera, problem.shelf, depth, mask))
@@ -434,6 +437,8 @@ class Searcher:
             if colour is not None and target_id is None:
                 detector = recogniser.detector
                 faults += colour_faults(problem.camera, problem.shelf, problem.target, detector, depth, colour)
+                if mask is None:
+                    faults += detection_faults(problem.camera, problem.shelf, detector, depth, colour, observation)
         return faults
 
     @functools.cached_property
