@@ -26,6 +26,7 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose
 from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
@@ -133,10 +134,15 @@ def test_without_an_action_it_says_why(problem):
 def test_what_does_not_tell_the_target_is_a_warning():
     searcher = Searcher()
     searcher.problem = types.SimpleNamespace(camera=CAMERA, shelf=SHELF, target=Target())
-    assert searcher._faults(IMAGES.depth, IMAGES.colour, None, None) == []
-    (fault,) = searcher._faults(IMAGES.depth, None, None, None)
+    unseen = Observation(empty(8), jnp.array(False), jnp.zeros(3))
+    assert searcher._faults(IMAGES.depth, IMAGES.colour, None, None, unseen) == []
+    red = np.where((IMAGES.mask == 0)[..., None], np.uint8([[[200, 10, 10]]]), IMAGES.colour)
+    (fault,) = searcher._faults(IMAGES.depth, red, None, None, unseen)
+    assert "pixels have the target's colour, but nothing that shows them has its shape and size" in fault
+    assert searcher._faults(IMAGES.depth, red, IMAGES.mask, None, unseen) == []
+    (fault,) = searcher._faults(IMAGES.depth, None, None, None, unseen)
     assert fault.startswith("images: the target cannot be told from the objects")
-    (fault,) = searcher._faults(IMAGES.depth, None, IMAGES.mask, 8)
+    (fault,) = searcher._faults(IMAGES.depth, None, IMAGES.mask, 8, unseen)
     assert fault.startswith("mask: no pixel holds the target's number 8")
 
 
