@@ -172,17 +172,17 @@ def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(wor
     assert np.isfinite(image.depth[~nothing]).all()
 
 
-def test_full_asks_the_truth_for_nothing(world):
-    """Not even a snapshot whose truth cannot be asked differs."""
+def test_full_reads_nothing_of_the_truth(world):
+    """A snapshot that refuses to give the truth does not differ."""
 
     class Blind(Snapshot):
         @property
         def target_seen(self):
-            raise AssertionError("full asked whether the target is in sight")
+            raise AssertionError("full read whether the target is in sight")
 
         @property
         def target_pose(self):
-            raise AssertionError("full asked where the target is")
+            raise AssertionError("full read where the target is")
 
     full, masks = recogniser("full", target_of(SCENE)), recogniser("masks", target_of(SCENE))
     jax.eval_shape(lambda here: full(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)

@@ -29,13 +29,13 @@ from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Number of points among which the densest place is sought, and to which the target is fitted.
+# Number of points that the densest place is chosen from, and that the target is fitted to.
 DRAWN = 256
 # Number of pixels by which placements are compared.
 COMPARED = 1024
-# Where less than this share of the evidence in more than so many of these pixels is for it, no others are asked.
+# Where less than this share of the evidence in more than so many of these pixels is for it, the others are left out.
 HOPELESS, LEAST_COMPARED = 0.5, 50
-# At how many places of the target's colour the target is sought, the one with the densest pixels first.
+# Largest number of places of the target's colour that are examined, the one with the densest pixels first.
 PLACES = 16
 # Radius of a place, and of the part of it that is not a place again, relative to the diagonal of the target.
 PLACE, PASSED = 0.6, 0.25

@@ -296,13 +296,7 @@ class Searcher:
         warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        # On an empty shelf f becomes empty because the target is not there.
-        if int(belief.restarts) > int(now.belief.restarts) and EMPTY_SHELF not in unseen:
-            warnings.append(
-                "f became empty and was started anew: something moved that was not seen, or a shape is wrong"
-            )
-        if bool(now.belief.found) and not bool(belief.found):
-            warnings.append("the target is not where it was found any more: it is searched for anew")
+        warnings += belief_faults(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
         decision, motion = self._decide(decision_key, belief, observation, depth, Present(joints, width))
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
@@ -320,16 +314,8 @@ class Searcher:
         )
         handed = motion.trajectory is not None
         refusals = now.refusals + (not handed)
-        self._state = State(
-            now.index,
-            belief,
-            observation,
-            decision.action,
-            handed=handed,
-            acted=False,
-            finished=False,
-            refusals=refusals,
-        )
+        latest = now.index, belief, observation, decision.action
+        self._state = State(*latest, handed=handed, acted=False, finished=False, refusals=refusals)
         return step
 
     def _decide(
@@ -445,6 +431,16 @@ class Searcher:
     def _digest(self) -> str:
         """SHA-256 of everything that a saved state depends on; not of the hand, nor of the target's place."""
         return hashlib.sha256(repr((self.workcell, self.config, self._seed)).encode()).hexdigest()
+
+
+def belief_faults(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:
+    """Warnings about what a look made of the belief; on an empty shelf f becomes empty, and nothing is wrong."""
+    faults = []
+    if int(after.restarts) > int(before.restarts) and not shelf_is_empty:
+        faults.append("f became empty and was started anew: something moved that was not seen, or a shape is wrong")
+    if bool(before.found) and not bool(after.found):
+        faults.append("the target is not where it was found any more: it is searched for anew")
+    return faults
 
 
 def crowd_faults(observation: Observation) -> list[str]:
