@@ -627,6 +627,26 @@ def test_impossible_trainings_are_refused(wrong, reason):
         TrainConfig(**wrong)
 
 
+def test_training_begins_with_the_weights_that_it_is_given(tmp_path):
+    task, archive = segmentation.SegmentationTask(network=SEGMENTATION), tmp_path / "segmentation.npz"
+    save_weights(archive, "segmentation", SEGMENTATION, parameters("segmentation"), {})
+    state = initial_state(task, TrainConfig(steps=1, seed=3, start=str(archive)))
+    random = initial_state(task, TrainConfig(steps=1, seed=3))
+    given = jax.tree.map(lambda a: np.asarray(a, np.float16), parameters("segmentation"))
+    for first, averaged, wanted in zip(
+        jax.tree.leaves(state.parameters), jax.tree.leaves(state.averaged), jax.tree.leaves(given), strict=True
+    ):
+        assert np.array_equal(first, wanted.astype(np.float32))
+        assert np.array_equal(averaged, first)
+    differ = jax.tree.map(lambda a, b: bool(np.any(a != b)), state.parameters, random.parameters)
+    assert any(jax.tree.leaves(differ))
+
+
+def test_weights_of_other_sizes_are_no_beginning():
+    with pytest.raises(InputError, match="of other sizes"):
+        initial_state(segmentation.SegmentationTask(network=SEGMENTATION), TrainConfig(steps=1, start="shipped"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["segmentation", "recognition"])
 def test_training_makes_the_loss_smaller(name, tmp_path):

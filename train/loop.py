@@ -24,12 +24,15 @@ from flax import serialization
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
+from mechsearch_jax.networks.weights import Weights, load_weights, shipped_weights
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import replacing
 
 HELD_OUT_SEED = 2**31 - 1
 CHECKPOINT = "checkpoint.msgpack"
 SCALARS = "scalars.jsonl"
+# `TrainConfig.start` of the package's own weights.
+SHIPPED = "shipped"
 
 Scalars = dict[str, Any]
 
@@ -51,6 +54,7 @@ class TrainConfig:
       chunk: steps in one dispatch; the last dispatch may exceed the length.
       save_every: seconds between checkpoints.
       held_out: scenes for the scores at the end.
+      start: the archive of weights to begin with, or "shipped" for the package's; random weights if None.
     """
 
     seed: int = 0
@@ -65,6 +69,7 @@ class TrainConfig:
     chunk: int = 20
     save_every: float = 45.0
     held_out: int = 512
+    start: str | None = None
 
     def __post_init__(self):
         if (self.steps is None) == (self.minutes is None):
@@ -152,9 +157,37 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
     )
 
 
-def initial_state(task: Task, config: TrainConfig) -> TrainState:
-    """The state before the first step."""
+def start_weights(name: str, start: str) -> Weights:
+    """The weights that `TrainConfig.start` stands for.
+
+    Args:
+      name: of the architecture.
+      start: an archive, or "shipped".
+
+    Raises:
+      InputError: a file is missing, damaged, or of another network.
+    """
+    return shipped_weights(name) if start == SHIPPED else load_weights(start, name)
+
+
+def _first_parameters(task: Task, config: TrainConfig) -> Any:
+    """Random parameters, or those of `TrainConfig.start`."""
     parameters = task.init(jax.random.fold_in(jax.random.key(config.seed), 2**32 - 1))
+    if config.start is None:
+        return parameters
+    weights = start_weights(task.name, config.start)
+    if jax.tree.map(jnp.shape, weights.parameters) != jax.tree.map(jnp.shape, parameters):
+        raise InputError(f"train: --start {config.start} holds a {task.name} network of other sizes; leave it out")
+    return jax.tree.map(jnp.asarray, weights.parameters)
+
+
+def initial_state(task: Task, config: TrainConfig) -> TrainState:
+    """The state before the first step.
+
+    Raises:
+      InputError: the weights to begin with are missing, damaged, or of another network.
+    """
+    parameters = _first_parameters(task, config)
     averaged = jax.tree.map(jnp.copy, parameters)
     return TrainState(parameters, averaged, _optimiser(config).init(parameters), jnp.zeros((), jnp.int32))
 

@@ -16,11 +16,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mechsearch_jax.problem.cache import keep_compilations
-from mechsearch_jax.train.loop import Task, TrainConfig, train
+from mechsearch_jax.train.loop import Task, TrainConfig, start_weights, train
 from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 
-TASKS: dict[str, Callable[[], Task]] = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
+TASKS: dict[str, Callable[..., Task]] = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
 # Largest number of printed groups of scores.
 SHOWN = 8
 # Seconds between lines if the output is no terminal.
@@ -111,6 +111,14 @@ def commit() -> str | None:
     return done.stdout.strip()
 
 
+def _origin_of(name: str, start: str | None) -> dict[str, Any] | None:
+    """What the card says of the weights that training began with; None if they were random."""
+    if start is None:
+        return None
+    card = start_weights(name, start).card
+    return {key: card.get(key) for key in ("sha256", "command", "commit", "steps", "training", "started_from")}
+
+
 def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
     """Train a network, score it on held-out scenes, and write its weights and card.
 
@@ -126,6 +134,8 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
       InputError: the folder holds another training, or cannot be written.
     """
     keep_compilations()
+    # Read before anything long begins, and before `out` may replace it.
+    started_from = _origin_of(task.name, config.start)
     # Draws the same random numbers by calls of one kernel: on a GPU, generating scenes compiles three times as fast.
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)
     console = Console(highlight=False)
@@ -136,6 +146,7 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
     card = {
         "data": task.origin,
         "training": dataclasses.asdict(config),
+        "started_from": started_from,
         "steps": int(state.step),
         "seed": config.seed,
         "commit": commit(),

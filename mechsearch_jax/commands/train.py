@@ -28,6 +28,7 @@ class Training:
       rate: highest learning rate.
       chunk: steps that the device makes before it reports.
       held_out: examples, at most, for each of the scores at the end.
+      start: archive of the weights to begin with, or "shipped" for those of the package; random ones if left out.
     """
 
     seed: int = 0
@@ -37,6 +38,7 @@ class Training:
     rate: float = 1e-3
     chunk: int = 20
     held_out: int = 512
+    start: Annotated[str | None, tyro.conf.arg(metavar="FILE|shipped", help_behavior_hint="")] = None
 
     def config(self, minutes: float) -> TrainConfig:
         """What the training loop takes.
@@ -58,19 +60,23 @@ class Training:
 def _training_of(name: Literal["segmentation", "recognition"], usual: Training) -> Callable[..., None]:
     """The command that trains one network of perception."""
 
-    def command(*, out: Path, training: Annotated[Training, tyro.conf.arg(name="")] = usual) -> None:
+    def command(
+        *, out: Path, touching: float = 0.2, training: Annotated[Training, tyro.conf.arg(name="")] = usual
+    ) -> None:
         from mechsearch_jax.runtime.files import check_writable
         from mechsearch_jax.train.run import TASKS, run
+        from mechsearch_jax.train.scenes import SceneConfig
 
-        config = training.config(minutes=10.0)
+        config, scenes = training.config(minutes=10.0), SceneConfig(touching=touching)
         check_writable(out)
-        run(TASKS[name](), config, out)
+        run(TASKS[name](scenes=scenes), config, out)
 
     command.__name__ = name
     command.__doc__ = f"""Train the network of {name} on scenes made as they are needed; goes on where it was stopped.
 
     Args:
       out: folder for the checkpoint, the curves (scalars.jsonl), and in the end {name}.npz and its card {name}.json.
+      touching: share of objects that are pushed against another.
       training: how it is trained.
     """
     return command
