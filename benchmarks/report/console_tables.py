@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mechsearch_jax.benchmarks.calibration import offsets
+from mechsearch_jax.benchmarks.looks import looks
 from mechsearch_jax.benchmarks.parts import push, scenes, segmentation
 from mechsearch_jax.benchmarks.parts.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.parts.bench import Timing
@@ -201,6 +202,28 @@ def calibration_table(measured: offsets.Measured) -> Group:
             f"without one {part['false warnings']} are warned of; {1e3 * part['median_seconds']:.0f} ms."
         )
     return Group(*tables, Text("\n".join(lines), style="dim"))
+
+
+def looks_tables(measured: looks.Measured) -> Group:
+    """What comes of depth images alone: a table for every noise, by pixels, contact and number of objects."""
+    tables: dict[str, Table] = {}
+    for line in measured.summary():
+        noise = line["noise"]
+        if noise not in tables:
+            head = f"{noise}: {line['looks']} looks, {line['phantoms']} phantoms"
+            tables[noise] = plain_table(head)
+            for name in ("objects", "counted", "wrong", "missing", "off", "turned", "IoU", "kinds"):
+                tables[noise].add_column(name, justify="left" if name in ("objects", "kinds") else "right")
+        numbers = [str(line[name]) for name in ("objects", "wrong", "missing", "off", "turned")]
+        kinds = ", ".join(f"{count} {kind}" for kind, count in line["kinds"].items())
+        tables[noise].add_row(line["group"], *numbers, f"{line['iou_mean']:.3f}", kinds)
+    value = measured.value()
+    explanation = (
+        "Visible objects of at least 100 pixels. off: more than 2 cm; turned: more than 15 degrees. Kinds: by the "
+        f"segments. {1e3 * value['median_seconds']:.0f} ms a look, compiled in {value['compile_seconds']:.0f} s; "
+        f"{measured.versions['device']}."
+    )
+    return Group(*tables.values(), Text(explanation, style="dim"))
 
 
 def push_scores_tables(measured: push.Measured) -> Group:

@@ -187,6 +187,12 @@ class SimulatedCell:
             np.round(255 * np.clip(colour, 0.0, 1.0)).astype(np.uint8),
         )
 
+    def shown(self) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
+        """The true depth of every pixel [m], infinite where nothing is, and its owner: a body's slot, the target last,
+        or a larger or negative number for anything else."""
+        depth, _, owner = self._cast()
+        return depth, owner
+
     def target_pixels(self) -> int:
         """Number of pixels of the target that the camera sees."""
         return int(np.sum(self._cast()[2] == TARGET))

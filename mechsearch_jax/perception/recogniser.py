@@ -24,6 +24,7 @@ from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.explanation import ExplanationConfig, explained_image
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
@@ -37,6 +38,7 @@ from mechsearch_jax.workspace.target import Target
 
 # Gives the target's pixels, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
+_EXPLANATION = ExplanationConfig()
 
 
 class Setting(Protocol):
@@ -73,6 +75,7 @@ class Recogniser:
       shapes: the recognition network.
       detector: finds the target's pixels in a colour image.
       refinement: how the network's shapes are fitted to the depth image.
+      explanation: how segments of images without a mask are split, joined and dropped; None to keep them.
     """
 
     camera: Camera
@@ -83,6 +86,7 @@ class Recogniser:
     shapes: ShapeNetwork
     detector: TargetDetector
     refinement: RefinementConfig
+    explanation: ExplanationConfig | None
 
     def __init__(
         self,
@@ -93,6 +97,7 @@ class Recogniser:
         weights: Weights | None = None,
         detector: TargetDetector | None = None,
         refinement: RefinementConfig | None = None,
+        explanation: ExplanationConfig | None = _EXPLANATION,
     ):
         """Set up recognition for a problem.
 
@@ -103,6 +108,7 @@ class Recogniser:
           weights: of the recognition network; by default the package's.
           detector: by default for a red target in any light, `TargetColour.lit()`.
           refinement: the default if None.
+          explanation: None to keep the segmenter's segments.
 
         Raises:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
@@ -118,6 +124,7 @@ class Recogniser:
             "shapes": ShapeNetwork.of(weights),
             "detector": _as_pytree(detector or TargetColour.lit()),
             "refinement": refinement or RefinementConfig(),
+            "explanation": explanation,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -132,12 +139,12 @@ class Recogniser:
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         data = (self.segmenter, self.shapes, self.detector, self.camera, self.view, self.shelf)
-        return data, (self.target, self.refinement)
+        return data, (self.target, self.refinement, self.explanation)
 
     @classmethod
     def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
         made = object.__new__(cls)
-        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf", "target", "refinement")
+        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf", "target", "refinement", "explanation")
         for name, value in zip(names, (*leaves, *static), strict=True):
             object.__setattr__(made, name, value)
         return made
@@ -174,14 +181,39 @@ class Recogniser:
         Raises:
           InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
+        return self.explained(key, depth, colour, mask, target_id)[0]
+
+    def explained(
+        self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
+    ) -> tuple[Observation, LabelledImage]:
+        """The observation, and the labelled image of the view that explains it: the pixels of label i show object i.
+
+        Args:
+          key, depth, colour, mask, target_id: as above.
+
+        Raises:
+          InputError: as above.
+        """
         check_images(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
+        if mask is None and self.explanation is not None:
+            explained, target_pose = explained_image(
+                jnp.concatenate([keys[1:], jax.random.fold_in(key, 3)[None]]),
+                image,
+                self.shapes,
+                self.view.camera,
+                self.shelf,
+                self.target,
+                self.refinement,
+                self.explanation,
+            )
+            return Observation(explained.scene, visible, target_pose), image.replace(labels=explained.labels)
         # Compiled separately, since it does not depend on where the labels come from.
         objects, target_pose = recognise_image(
             keys[1:], image, self.shapes, self.view.camera, self.shelf, self.target, self.refinement
         )
-        return Observation(objects, visible, target_pose)
+        return Observation(objects, visible, target_pose), image
 
 
 def _as_pytree(slot: Any) -> Any:

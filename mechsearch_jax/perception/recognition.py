@@ -8,7 +8,7 @@ from typing import Any, cast
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
@@ -151,10 +151,25 @@ def recognise_image(
       Eight slots, of which slot i is instance i; and x, y [m] and yaw [rad] of the target, meaningless but finite if it
       has no pixels.
     """
+    scene, _, pose, _ = fitted_segments(keys, image, shapes, camera, shelf, target, refinement)
+    return standard_edges(scene), pose
+
+
+def fitted_segments(
+    keys: Key[Array, "2"],
+    image: LabelledImage,
+    shapes: ShapeNetwork,
+    camera: Camera,
+    shelf: Shelf,
+    target: Target,
+    refinement: RefinementConfig,
+) -> tuple[Superquadrics, Int[Array, "h w"], Float[Array, " 3"], Bool[Array, ""]]:
+    """The refined objects of an image's segments, the labels without segments on the target, its pose, and whether it
+    has pixels; arguments as of `recognise_image`."""
     object_key, target_key = keys
     pose, has_pixels = fitted_pose(target_key, target, shelf, camera, image.points, image.of_target)
     on_it = near_target(target, shelf, pose, image.points) & has_pixels
     labels = without_phantoms(image.labels, on_it, image.of_target)
     scene = recognise(object_key, shapes.network, shapes.parameters, camera, image.points, labels, shelf)
     refined = refine(camera, shelf, scene, image.points.reshape(-1, 3), labels.reshape(-1), image.depth, refinement)
-    return standard_edges(refined.scene), pose
+    return refined.scene, labels, pose, has_pixels

@@ -1,0 +1,316 @@
+"""What comes of a depth image alone: every visible object, end to end, from another renderer's images.
+
+MuJoCo casts the rays, and a sensor's noise is added. The recogniser gets the whole camera image and nothing else.
+Its objects are compared with the true bodies.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from mechsearch_jax.benchmarks.looks.scoring import (
+    OFF,
+    PIXELS,
+    TOUCHING,
+    TURNED,
+    Phantom,
+    Row,
+    bordering,
+    failure_kind,
+    gaps,
+    matched,
+    phantom_kind,
+    thing_of,
+    turned_by,
+)
+from mechsearch_jax.envs.cell.simulated_cell import SensorNoise, SimulatedCell
+from mechsearch_jax.envs.world.world import TARGET
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.images.noise import TimeOfFlight, depth_of
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import Thing
+from mechsearch_jax.perception.explanation import ExplanationConfig
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.perception.scores import EDGE, intersection_over_union, sharpened
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.versions import versions
+from mechsearch_jax.workspace.scenario import Body, Scenario, superquadrics
+
+NoiseName = Literal["clean", "gaussian", "time-of-flight"]
+Segments = Literal["network", "explained", "true"]
+# Ranges of pixels by which objects are counted: name, from, to below.
+SIZES = (("100 to 1000", 100, 1000), ("1000 to 5000", 1000, 5000), ("5000 and more", 5000, np.inf))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Picture:
+    """An image of a scene before noise.
+
+    Attributes:
+      depth: [m], shape (H, W); infinite where nothing is.
+      owner: the body's slot of each pixel, the target last; larger or negative for anything else.
+    """
+
+    depth: Float[np.ndarray, "h w"]
+    owner: Int[np.ndarray, "h w"]
+
+
+def taken(workcell: Workcell, scenario: Scenario) -> Picture:
+    """The image of a scene, by MuJoCo's ray-casting; the arm is at home."""
+    cell = SimulatedCell(workcell, scenario, noise=SensorNoise(0.0, 0.0, 0.0))
+    depth, owner = cell.shown()
+    return Picture(depth.astype(np.float32), owner.astype(np.int8))
+
+
+def noisy(workcell: Workcell, picture: Picture, noise: str, seed: int) -> Float[np.ndarray, "h w"]:
+    """The depth image as a sensor measures it [m]; 0 where nothing was measured.
+
+    Raises:
+      InputError: the noise is unknown.
+    """
+    depth = picture.depth
+    match noise:
+        case "clean":
+            measured = depth
+        case "gaussian":
+            measured = depth + np.random.default_rng(seed).normal(0.0, 0.001, depth.shape)
+        case "time-of-flight":
+            points = TimeOfFlight()(jax.random.key(seed), workcell.camera, jnp.asarray(depth))
+            measured = np.asarray(depth_of(workcell.camera, points))
+        case _:
+            raise InputError(f'bench looks: noise "{noise}" is unknown; use clean, gaussian or time-of-flight')
+    return np.where(np.isfinite(measured), measured, 0.0).astype(np.float32)
+
+
+@jax.jit
+def _volumes(truth: Superquadrics, answers: Superquadrics) -> Float[jax.Array, "n m"]:
+    """Intersection over union of every body with every recognised object."""
+    n, m = truth.capacity, answers.capacity
+    rows = jax.tree.map(lambda a: jnp.broadcast_to(a[:, None], (n, m, *a.shape[1:])), sharpened(truth))
+    columns = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (n, m, *a.shape[1:])), answers)
+    return intersection_over_union(rows, columns)
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """Results of a run.
+
+    Attributes:
+      rows: one for every visible object of every look.
+      phantoms: of all looks.
+      seconds: of each look, from image to observation [s].
+      compile_seconds: of the first look, minus the median of the others [s].
+      settings: scenes, noises, segments and seed.
+      versions: as `versions` returns them.
+    """
+
+    rows: tuple[Row, ...]
+    phantoms: tuple[Phantom, ...]
+    seconds: tuple[float, ...]
+    compile_seconds: float
+    settings: dict[str, Any]
+    versions: dict[str, str]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Counts by noise: of all objects, by pixels, by contact and by number of objects."""
+        lines = []
+        for noise in dict.fromkeys(row.noise for row in self.rows):
+            rows = [row for row in self.rows if row.noise == noise]
+            groups: dict[str, Sequence[Row]] = {"all": rows}
+            groups |= {f"{name} pixels": [r for r in rows if low <= r.pixels < high] for name, low, high in SIZES}
+            groups["touching"] = [row for row in rows if row.gap < TOUCHING]
+            groups["bordering in the image"] = [row for row in rows if row.gap >= TOUCHING and row.beside]
+            groups["apart"] = [row for row in rows if row.gap >= TOUCHING and not row.beside]
+            counts = sorted({row.objects for row in rows})
+            groups |= {f"{count} objects": [row for row in rows if row.objects == count] for count in counts}
+            lines += [{"noise": noise, "group": name} | figures(chosen) for name, chosen in groups.items() if chosen]
+            phantoms = [phantom for phantom in self.phantoms if phantom.noise == noise]
+            lines[-len([g for g in groups.values() if g])] |= {
+                "looks": len({row.scene for row in rows}),
+                "phantoms": len(phantoms),
+                "phantom_kinds": dict(Counter(phantom.kind for phantom in phantoms)),
+            }
+        return lines
+
+    def value(self) -> dict[str, Any]:
+        """As JSON values, without the rows of objects that are right."""
+        return {
+            "settings": self.settings,
+            "versions": self.versions,
+            "median_seconds": statistics.median(self.seconds),
+            "compile_seconds": self.compile_seconds,
+            "summary": self.summary(),
+            "wrong": [dataclasses.asdict(row) for row in self.rows if row.outcome != "right"],
+            "phantoms": [dataclasses.asdict(phantom) for phantom in self.phantoms],
+        }
+
+
+def figures(rows: Sequence[Row]) -> dict[str, Any]:
+    """Counts of outcomes and of kinds of failures, and the mean intersection over union; at least one row."""
+    wrong = [row for row in rows if row.outcome != "right"]
+    outcomes = Counter(row.outcome for row in rows)
+    return {
+        "objects": len(rows),
+        "wrong": len(wrong),
+        "wrong_share": round(len(wrong) / len(rows), 4),
+        **{name: outcomes[name] for name in ("missing", "off", "turned")},
+        "kinds": dict(Counter(row.kind for row in wrong)),
+        "iou_mean": round(float(np.mean([row.iou for row in rows])), 4),
+    }
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """A measurement of looks.
+
+    Attributes:
+      pictures: images of scenes by name, each with its scenario.
+      noises: of `NoiseName`.
+      segments: "explained" or "network" for depth images alone, with and without `perception.explanation`; "true" for
+        the true masks beside them.
+      seed: of the noise and of the recogniser.
+      workcell: camera and shelf; its target is what the recogniser knows.
+      explanation: of "explained" segments.
+    """
+
+    pictures: Mapping[str, tuple[Scenario, Picture]]
+    noises: Sequence[str] = ("gaussian",)
+    segments: Segments = "explained"
+    seed: int = 0
+    workcell: Workcell = dataclasses.field(default_factory=Workcell)
+    explanation: ExplanationConfig = dataclasses.field(default_factory=ExplanationConfig)
+
+    def __post_init__(self):
+        if not self.pictures or not self.noises:
+            raise InputError("bench looks: there is nothing to look at; give scenes and at least one noise")
+
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
+        """Look at everything.
+
+        Args:
+          on_progress: called after every look with the number of looks so far.
+        """
+        recogniser = Recogniser(self.workcell, explanation=self.explanation if self.segments == "explained" else None)
+        first = self.look(recogniser, next(iter(self.pictures)), self.noises[0])[2]
+        rows: list[Row] = []
+        phantoms: list[Phantom] = []
+        seconds: list[float] = []
+        for noise in self.noises:
+            for name in self.pictures:
+                observation, segments, spent = self.look(recogniser, name, noise)
+                scored, extra = judged(*self.pictures[name], noise, observation, segments, recogniser.view.of)
+                rows += scored
+                phantoms += extra
+                seconds.append(spent)
+                on_progress(len(seconds))
+        settings = {
+            "scenes": len(self.pictures),
+            "names": [min(self.pictures), max(self.pictures)],
+            "noises": list(self.noises),
+            "segments": self.segments,
+            "seed": self.seed,
+            "least_pixels": PIXELS,
+        }
+        compiling = max(first - statistics.median(seconds), 0.0)
+        return Measured(tuple(rows), tuple(phantoms), tuple(seconds), compiling, settings, versions())
+
+    def look(self, recogniser: Recogniser, name: str, noise: str) -> tuple[Observation, Int[np.ndarray, "h w"], float]:
+        """One look: the observation, the labels of the recogniser's view, and its time [s]."""
+        index = list(self.pictures).index(name)
+        picture = self.pictures[name][1]
+        depth = noisy(self.workcell, picture, noise, self.seed * 100_003 + index)
+        masks: dict[str, Any] = {}
+        if self.segments == "true":
+            shown = (picture.owner >= 0) & (picture.owner <= TARGET)
+            masks = {"mask": np.where(shown, picture.owner, -2).astype(np.int8), "target_id": TARGET}
+        key = jax.random.fold_in(jax.random.key(self.seed), index)
+        start = time.perf_counter()
+        observation, image = jax.block_until_ready(recogniser.explained(key, depth, **masks))
+        return observation, np.asarray(image.labels), time.perf_counter() - start
+
+
+def judged(
+    scenario: Scenario,
+    picture: Picture,
+    noise: str,
+    observation: Observation,
+    segments: Int[np.ndarray, "h w"],
+    view: Callable[[Any], Any],
+) -> tuple[list[Row], list[Phantom]]:
+    """The outcomes of a look.
+
+    Args:
+      scenario, picture: the truth.
+      noise: its name.
+      observation: without batch axes.
+      segments: the labels of the recogniser's view, of which label i is object i.
+      view: cuts the recogniser's view out of an image.
+    """
+    bodies: list[Body] = [*scenario.objects, scenario.target]
+    slots = [*range(len(scenario.objects)), TARGET]
+    objects = observation.objects
+    answers = np.flatnonzero(np.asarray(objects.valid))
+    iou = np.asarray(_volumes(superquadrics(bodies, TARGET + 1), objects))[: len(bodies), answers]
+    places = np.array([body.position for body in bodies])
+    distance = np.linalg.norm(places[:, None] - np.asarray(objects.position, float)[None, answers], axis=-1)
+    chosen, stands_for_one = matched(iou, distance)
+    owner = np.asarray(view(picture.owner))
+    apart = gaps(bodies)
+    unsure = np.full(objects.capacity, np.nan)
+    confidence = unsure if observation.confidence is None else np.asarray(observation.confidence, float)
+    rows = []
+    for i, (slot, body) in enumerate(zip(slots[:-1], bodies, strict=False)):
+        pixels = int((picture.owner == slot).sum())
+        if pixels < PIXELS:
+            continue
+        answer = None if chosen[i] < 0 else int(answers[chosen[i]])
+        centre = None if answer is None else float(distance[i, chosen[i]])
+        angle = None if answer is None else turned_by(thing_of("", body), _answer(objects, answer))
+        outcome = "right"
+        if centre is None or angle is None:
+            outcome = "missing"
+        elif centre > OFF:
+            outcome = "off"
+        elif angle > TURNED:
+            outcome = "turned"
+        rows.append(
+            Row(
+                scene=scenario.name,
+                object=slot,
+                objects=len(scenario.objects),
+                noise=noise,
+                shape=body.shape,
+                pixels=pixels,
+                gap=round(float(apart[i]), 4),
+                beside=bordering(owner, slot),
+                outcome=outcome,
+                kind="" if outcome == "right" else failure_kind(slot, owner, segments),
+                centre=None if centre is None else round(centre, 4),
+                angle=None if angle is None else round(angle, 1),
+                iou=0.0 if answer is None else round(float(iou[i, chosen[i]]), 4),
+                confidence=None if answer is None else round(float(confidence[answer]), 3),
+            )
+        )
+    phantoms = [
+        Phantom(scenario.name, noise, int(a), phantom_kind(int(a), owner, segments), round(float(confidence[a]), 3))
+        for a in answers[~stands_for_one]
+    ]
+    return rows, phantoms
+
+
+def _answer(objects: Superquadrics, slot: int) -> Thing:
+    size, exponents, position, rotation = (
+        np.asarray(a[slot], float) for a in (objects.size, objects.exponents, objects.position, objects.rotation)
+    )
+    return Thing("", size, bool(exponents[1] > EDGE), rotation, position)

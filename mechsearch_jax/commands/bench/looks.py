@@ -1,0 +1,65 @@
+"""`mechsearch bench looks`: what comes of depth images alone, end to end."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from mechsearch_jax.commands.options import (
+    JsonFile,
+    Scenarios,
+    check_files,
+    find_scenarios,
+    forget_kept_compilations,
+)
+
+Noise = Literal["clean", "gaussian", "time-of-flight"]
+
+
+def bench_looks(
+    scenarios: Scenarios,
+    /,
+    *,
+    noise: tuple[Noise, ...] = ("gaussian",),
+    segments: Literal["network", "explained", "true"] = "explained",
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Measure what comes of a depth image alone: which visible objects are missing, off or turned, and phantoms.
+
+    MuJoCo renders the images, not the package's own camera.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      noise: of the depth image, one or more; "gaussian" is 1 mm.
+      segments: those that explain the image, the segmentation network's alone, or the true masks.
+      seed: of the noise and of the recogniser.
+      out: JSON file for the figures, and for every object that is not right.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.looks import looks
+    from mechsearch_jax.benchmarks.report.console_tables import looks_tables
+    from mechsearch_jax.problem.workcell import Workcell
+    from mechsearch_jax.runtime.files import save_json
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    check_files(out)
+    files = find_scenarios(scenarios)
+    console = Console(highlight=False)
+    with console.status("rendering") as status:
+        pictures = {}
+        for number, file in enumerate(files):
+            scenario = load_scenario(file)
+            pictures[scenario.name] = scenario, looks.taken(Workcell(), scenario)
+            status.update(f"rendering {number + 1}/{len(files)}")
+        bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), segments, seed)
+        forget_kept_compilations()
+        total = len(bench.pictures) * len(bench.noises)
+        status.update("compiling")
+        measured = bench.run(lambda done: status.update(f"looking {done}/{total}"))
+        if out is not None:
+            save_json(measured.value(), out)
+    console.print(looks_tables(measured))
+
+
+COMMANDS = {"looks": bench_looks}
