@@ -49,8 +49,9 @@ class ExplanationConfig:
       merges: number of pairs of bordering segments that are joined.
       points: number of points that an explanation is judged by.
       rays: at most about so many rays, spread evenly over the view.
-      exact: a point this near to an object's surface is explained.
-      wrong: a point this far from it is not; between the two its cost grows evenly.
+      exact: a point this near to an object's surface is explained, or one that is so many times as near as ...
+      deviations: ... the median of the points of the segments.
+      wrong: a point that is farther by this is not; between the two its cost grows evenly.
       shrink: rays may pass this deep below an object's faces.
       doubtful: a segment is divided if so many of its pixels are badly explained, and ...
       doubtful_share: ... such a share of them.
@@ -66,9 +67,10 @@ class ExplanationConfig:
     splits: int = 3
     merges: int = 3
     points: int = 4096
-    rays: int = 4096
+    rays: int = 16384
     exact: float = 0.003
-    wrong: float = 0.008
+    deviations: float = 2.5
+    wrong: float = 0.005
     shrink: float = 0.005
     doubtful: float = 8.0
     doubtful_share: float = 0.04
@@ -85,8 +87,8 @@ class ExplanationConfig:
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"ExplanationConfig: {field.name} ({value}) must be positive")
-        if not (self.splits <= SLOTS and self.exact < self.wrong):
-            raise InputError(f"ExplanationConfig: splits must be at most {SLOTS}, and exact below wrong")
+        if self.splits > SLOTS:
+            raise InputError(f"ExplanationConfig: splits ({self.splits}) must be at most {SLOTS}")
 
 
 class Explained(flax.struct.PyTreeNode):
@@ -118,7 +120,8 @@ class _Sample(flax.struct.PyTreeNode):
       weight: pixels for each point.
       directions: of rays, shape (R, 3).
       free: length up to which each ray is free; 0 if nothing was measured.
-      ray_weight: pixels for each ray.
+      exact: a point this near to a surface is explained [m].
+      ray_weight: pixels for each ray; static.
     """
 
     points: jax.Array
@@ -126,10 +129,13 @@ class _Sample(flax.struct.PyTreeNode):
     weight: jax.Array
     directions: jax.Array
     free: jax.Array
+    exact: jax.Array
     ray_weight: float = flax.struct.field(pytree_node=False)
 
 
-def _sample(key: Array, image: LabelledImage, camera: Camera, config: ExplanationConfig) -> _Sample:
+def _sample(
+    key: Array, image: LabelledImage, base: Superquadrics, camera: Camera, config: ExplanationConfig
+) -> _Sample:
     things = (image.labels != FREE) & (image.labels != MISSING) & ~image.of_target
     index, total = draw(key, things.reshape(-1), config.points)
     height, width = image.labels.shape
@@ -138,18 +144,23 @@ def _sample(key: Array, image: LabelledImage, camera: Camera, config: Explanatio
     seen = image.depth[rows[:, None], columns[None, :]].reshape(-1)
     grid = jnp.meshgrid(rows * 1.0, columns * 1.0, indexing="ij")
     free = jnp.where(jnp.isnan(seen), 0.0, jnp.minimum(seen, FAR))
+    label = jnp.where(total > 0, image.labels.reshape(-1)[index], OTHER).astype(jnp.int32)
+    points = jnp.where(total > 0, image.points.reshape(-1, 3)[index], 0.0)
+    own = jnp.abs(surface_distance(base, points))[jnp.maximum(label, 0), jnp.arange(config.points)]
+    usual = jnp.nanmedian(jnp.where((label >= 0) & base.valid[jnp.maximum(label, 0)], own, jnp.nan))
     return _Sample(
-        points=image.points.reshape(-1, 3)[index],
-        label=jnp.where(total > 0, image.labels.reshape(-1)[index], OTHER),
+        points=points,
+        label=label,
         weight=total / config.points,
         directions=pixel_rays(camera, *grid).reshape(-1, 3),
         free=free,
+        exact=jnp.maximum(config.exact, config.deviations * jnp.nan_to_num(usual)),
         ray_weight=float(step**2),
     )
 
 
-def _point_cost(distance: Array, config: ExplanationConfig) -> Array:
-    return jnp.clip((jnp.abs(distance) - config.exact) / (config.wrong - config.exact), 0.0, 1.0)
+def _point_cost(distance: Array, sample: _Sample, config: ExplanationConfig) -> Array:
+    return jnp.clip((jnp.abs(distance) - sample.exact) / config.wrong, 0.0, 1.0)
 
 
 def _passed(scene: Superquadrics, origin: Array, sample: _Sample, config: ExplanationConfig) -> Float[Array, " n"]:
@@ -209,7 +220,7 @@ def _two_means(points: Float[Array, "p 3"], member: Bool[Array, " p"]) -> Bool[A
 
 
 def _parts(
-    image: LabelledImage, base: Superquadrics, chosen: Int[Array, " k"], config: ExplanationConfig
+    image: LabelledImage, base: Superquadrics, chosen: Int[Array, " k"], exact: Array, config: ExplanationConfig
 ) -> Bool[Array, "k ways h w"]:
     """First parts of segments in each way of division: the points that are on the fitted object; the largest connected
     piece; the points on one side of a vertical plane."""
@@ -221,7 +232,7 @@ def _parts(
     def divide(slot):
         member = labels == slot
         solid = jax.tree.map(lambda a: a[slot][None], base)
-        on_it = member & (jnp.abs(surface_distance(solid, flat)[0]) < (config.exact + config.wrong) / 2)
+        on_it = member & (jnp.abs(surface_distance(solid, flat)[0]) < exact + config.wrong / 2)
         sizes = jnp.zeros(labels.size, jnp.int32).at[numbers].add(member.astype(jnp.int32))
         piece = member & (numbers == jnp.argmax(sizes))
         return jnp.stack([on_it, piece, _two_means(flat, member)]).reshape(WAYS, *shape)
@@ -305,17 +316,17 @@ def explain(
     """
     keys = jax.random.split(key, 2)
     origin = jnp.array(camera.position)
-    sample = _sample(keys[0], image, camera, config)
+    sample = _sample(keys[0], image, base, camera, config)
     distance = surface_distance(base, sample.points)
     pixels = jnp.sum(image.labels.reshape(-1)[:, None] == jnp.arange(SLOTS)[None], axis=0)
     of_own = sample.label[None] == jnp.arange(SLOTS)[:, None]
-    badly = jnp.sum(_point_cost(distance, config) * of_own, axis=1) * sample.weight
+    badly = jnp.sum(_point_cost(distance, sample, config) * of_own, axis=1) * sample.weight
     bad = jnp.where(base.valid, badly + _passed(base, origin, sample, config), 0.0)
 
     # Hypotheses: both parts of every division, and every union.
     worst, chosen = jax.lax.top_k(bad, config.splits)
     doubtful = (worst > config.doubtful) & (worst > config.doubtful_share * pixels[chosen])
-    first = _parts(image, base, chosen, config)
+    first = _parts(image, base, chosen, sample.exact, config)
     whole = (image.labels[None] == chosen[:, None, None])[:, None]
     parts = jnp.stack([first, whole & ~first], axis=2).reshape(-1, *image.labels.shape)
     counts = jnp.sum(parts, axis=(1, 2)).reshape(-1, 2)
@@ -367,7 +378,7 @@ def _selected(
     """Which objects explain the image at the least cost, by the best change at a time from those of the segments."""
     capacity = scene.capacity
     of_target = jnp.arange(capacity) == capacity - 1
-    cost = jnp.where(scene.valid[:, None], _point_cost(surface_distance(scene, sample.points), config), 1.0)
+    cost = jnp.where(scene.valid[:, None], _point_cost(surface_distance(scene, sample.points), sample, config), 1.0)
     price = config.object + _passed(scene, origin, sample, config)
     price = jnp.where(of_target, 0.0, price)
     overlap = config.overlap_cost * 100.0 * jnp.maximum(penetrations(scene) - config.overlap, 0.0)
@@ -420,12 +431,12 @@ def _explained(
     gone = (labels >= 0) & ~kept[jnp.maximum(labels, 0)] & everything.valid[:SLOTS][jnp.maximum(labels, 0)]
     flat = jnp.where((labels == MISSING).reshape(-1, 1), 0.0, image.points.reshape(-1, 3))
     near = jnp.where(scene.valid[:, None], jnp.abs(surface_distance(scene, flat)), jnp.inf)
-    nearest = jnp.where(jnp.min(near, axis=0) < 2 * config.wrong, jnp.argmin(near, axis=0), OTHER)
+    nearest = jnp.where(jnp.min(near, axis=0) < sample.exact + 2 * config.wrong, jnp.argmin(near, axis=0), OTHER)
     labels = jnp.where(gone, nearest.reshape(labels.shape), labels).astype(labels.dtype)
 
     own = labels.reshape(-1)[None] == jnp.arange(SLOTS)[:, None]
     pixels = jnp.sum(own, axis=1)
-    wrong = jnp.sum(jnp.where(own, _point_cost(near, config), 0.0), axis=1)
+    wrong = jnp.sum(jnp.where(own, _point_cost(near, sample, config), 0.0), axis=1)
     return Explained(
         scene=scene,
         labels=labels,

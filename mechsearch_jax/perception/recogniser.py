@@ -38,7 +38,6 @@ from mechsearch_jax.workspace.target import Target
 
 # Gives the target's pixels, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
-_EXPLANATION = ExplanationConfig()
 
 
 class Setting(Protocol):
@@ -97,7 +96,7 @@ class Recogniser:
         weights: Weights | None = None,
         detector: TargetDetector | None = None,
         refinement: RefinementConfig | None = None,
-        explanation: ExplanationConfig | None = _EXPLANATION,
+        explanation: ExplanationConfig | None = None,
     ):
         """Set up recognition for a problem.
 
@@ -108,7 +107,7 @@ class Recogniser:
           weights: of the recognition network; by default the package's.
           detector: by default for a red target in any light, `TargetColour.lit()`.
           refinement: the default if None.
-          explanation: None to keep the segmenter's segments.
+          explanation: how segments are split, joined and dropped; None, the default, to keep the segmenter's.
 
         Raises:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
