@@ -46,7 +46,7 @@ def test_rays_enter_where_the_renderer_sees_the_surface(objects):
     rng = np.random.default_rng(2)
     origin = jnp.float32([-0.4, 0.1, 1.2])
     ends = np.float32([0.6, 0.0, 0.9]) + rng.uniform(-0.15, 0.15, (800, 3)).astype(np.float32)
-    directions = jnp.asarray(ends) - origin
+    directions = jnp.asarray(ends) - origin[None]
     enter = np.asarray(entries(objects, origin, directions))
     seen = np.stack([object_depth(jax.tree.map(lambda a: a[i], objects), origin, directions) for i in range(COUNT)])  # noqa: B023
     both = np.isfinite(enter) & np.isfinite(seen)
