@@ -15,11 +15,8 @@ class Observation(flax.struct.PyTreeNode):
       objects: the recognised objects, without the target, fields (..., N, ...).
       target_visible: whether the target is visible, bool, shape (...).
       target_pose: x, y [m] and yaw [rad] in the world, shape (..., 3); arbitrary if it is not visible.
-      confidence: probability that each object is within 2 cm and 15 degrees of the truth, shape (..., N); None if the
-        objects are known.
     """
 
     objects: Superquadrics
     target_visible: jax.Array
     target_pose: jax.Array
-    confidence: jax.Array | None = None

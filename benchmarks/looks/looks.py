@@ -267,8 +267,6 @@ def judged(
     chosen, stands_for_one = matched(iou, distance)
     owner = np.asarray(view(picture.owner))
     apart = gaps(bodies)
-    unsure = np.full(objects.capacity, np.nan)
-    confidence = unsure if observation.confidence is None else np.asarray(observation.confidence, float)
     rows = []
     for i, (slot, body) in enumerate(zip(slots[:-1], bodies, strict=False)):
         pixels = int((picture.owner == slot).sum())
@@ -299,12 +297,10 @@ def judged(
                 centre=None if centre is None else round(centre, 4),
                 angle=None if angle is None else round(angle, 1),
                 iou=0.0 if answer is None else round(float(iou[i, chosen[i]]), 4),
-                confidence=None if answer is None else round(float(confidence[answer]), 3),
             )
         )
     phantoms = [
-        Phantom(scenario.name, noise, int(a), phantom_kind(int(a), owner, segments), round(float(confidence[a]), 3))
-        for a in answers[~stands_for_one]
+        Phantom(scenario.name, noise, int(a), phantom_kind(int(a), owner, segments)) for a in answers[~stands_for_one]
     ]
     return rows, phantoms
 

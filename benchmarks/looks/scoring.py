@@ -52,7 +52,6 @@ class Row:
       centre: distance of the centres [m]; None if missing.
       angle: by which it is turned, but for the shape's symmetries [degrees]; None if missing.
       iou: intersection over union of the volumes; 0 if missing.
-      confidence: as in `Observation`; None if missing.
     """
 
     scene: str
@@ -68,7 +67,6 @@ class Row:
     centre: float | None
     angle: float | None
     iou: float
-    confidence: float | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,14 +77,12 @@ class Phantom:
       scene, noise: of the look.
       slot: of the recognised object.
       kind: "split" if its segment lies mostly on one body, else "other".
-      confidence: as in `Observation`.
     """
 
     scene: str
     noise: str
     slot: int
     kind: str
-    confidence: float
 
 
 def thing_of(name: str, body: Body) -> Thing:
