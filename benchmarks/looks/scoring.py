@@ -97,12 +97,12 @@ def thing_of(name: str, body: Body) -> Thing:
 
 
 def gaps(bodies: Sequence[Body]) -> Float[np.ndarray, " n"]:
-    """Approximate distance of each body from the nearest other [m]; negative if they overlap."""
+    """Approximate distance of each body from the nearest other, at most 1 m [m]; negative if they overlap."""
     things = [thing_of("", body) for body in bodies]
-    apart = np.full((len(things), len(things)), np.inf)
+    apart = np.ones((len(things), len(things)))
     for i, j in itertools.combinations(range(len(things)), 2):
         apart[i, j] = apart[j, i] = -depth_in_each_other(things[i], things[j])
-    return apart.min(axis=1, initial=np.inf)
+    return apart.min(axis=1, initial=1.0)
 
 
 def _turns() -> np.ndarray:

@@ -1,0 +1,137 @@
+"""Other segments than the network's: parts of doubtful ones, unions of bordering ones, and objects fitted to them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.images.labels import MISSING
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise
+from mechsearch_jax.perception.refinement import RefinementConfig, refine
+from mechsearch_jax.perception.solids import surface_distance
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Number of objects of an observation.
+SLOTS = 8
+# Ways in which a segment is divided: see `parts`.
+WAYS = 3
+# Rounds of spreading the numbers of connected pixels; each doubles how far they reach.
+_SPREADS = 12
+
+
+def _connected(points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float) -> Int[Array, "h w"]:
+    """A number for each pixel, the same for connected pixels of a segment.
+
+    Each round takes the least number of the neighbours, and of the pixel that has the number.
+    """
+    height, width = labels.shape
+    number = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
+
+    def near(axis):
+        apart = jnp.linalg.norm(jnp.diff(points, axis=axis), axis=-1)
+        first, second = (jax.lax.slice_in_dim(labels, i, labels.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
+        return (first == second) & (apart < jump)
+
+    down, right = near(0), near(1)
+
+    def spread(_, number):
+        big = jnp.int32(height * width)
+        lower = jnp.pad(jnp.where(down, number[1:], big), ((0, 1), (0, 0)), constant_values=height * width)
+        upper = jnp.pad(jnp.where(down, number[:-1], big), ((1, 0), (0, 0)), constant_values=height * width)
+        after = jnp.pad(jnp.where(right, number[:, 1:], big), ((0, 0), (0, 1)), constant_values=height * width)
+        before = jnp.pad(jnp.where(right, number[:, :-1], big), ((0, 0), (1, 0)), constant_values=height * width)
+        least = jnp.minimum(number, jnp.minimum(jnp.minimum(lower, upper), jnp.minimum(after, before)))
+        flat = number.reshape(-1)
+        flat = flat.at[flat].min(least.reshape(-1))
+        flat = flat[flat]
+        return flat[flat].reshape(height, width)
+
+    return jax.lax.fori_loop(0, _SPREADS, spread, number)
+
+
+def _two_means(points: Float[Array, "p 3"], member: Bool[Array, " p"]) -> Bool[Array, " p"]:
+    """Which points of a segment are nearer to the second of two centres, seen from above."""
+    level = jnp.where(member[:, None], points[:, :2], 0.0)
+    weight = member.astype(jnp.float32)
+    mean = jnp.sum(level, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
+    offset = (level - mean[None]) * weight[:, None]
+    spread = jnp.einsum("pi,pj->ij", offset, offset, precision="highest")
+    angle = 0.5 * jnp.arctan2(2.0 * spread[0, 1], spread[0, 0] - spread[1, 1])
+    axis = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    side = offset[:, 0] * axis[0] + offset[:, 1] * axis[1]
+
+    def assign(_, cut):
+        def middle(chosen):
+            return jnp.sum(jnp.where(chosen, side, 0.0)) / jnp.maximum(jnp.sum(chosen), 1)
+
+        return (middle(member & (side > cut)) + middle(member & (side <= cut))) / 2.0
+
+    return member & (side > jax.lax.fori_loop(0, 8, assign, jnp.float32(0.0)))
+
+
+def parts(
+    image: LabelledImage, base: Superquadrics, chosen: Int[Array, " k"], near: Array, jump: float
+) -> Bool[Array, "k ways h w"]:
+    """First parts of segments in each way of division: the points that are on the fitted object; the largest connected
+    piece; the points on one side of a vertical plane."""
+    shape = image.labels.shape
+    numbers = _connected(image.points, image.labels, jump).reshape(-1)
+    flat = jnp.where((image.labels == MISSING).reshape(-1, 1), 0.0, image.points.reshape(-1, 3))
+    labels = image.labels.reshape(-1)
+
+    def divide(slot):
+        member = labels == slot
+        solid = jax.tree.map(lambda a: a[slot][None], base)
+        on_it = member & (jnp.abs(surface_distance(solid, flat)[0]) < near)
+        sizes = jnp.zeros(labels.size, jnp.int32).at[numbers].add(member.astype(jnp.int32))
+        piece = member & (numbers == jnp.argmax(sizes))
+        return jnp.stack([on_it, piece, _two_means(flat, member)]).reshape(WAYS, *shape)
+
+    return jax.lax.map(divide, chosen)
+
+
+def bordering(image: LabelledImage, jump: float) -> Float[Array, "8 8"]:
+    """Number of neighbouring pixels of every two segments whose points are near; each pair once, above the diagonal."""
+    total = jnp.zeros((SLOTS, SLOTS))
+    for axis in (0, 1):
+        apart = jnp.linalg.norm(jnp.diff(image.points, axis=axis), axis=-1)
+        size = image.labels.shape[axis]
+        first, second = (
+            jax.lax.slice_in_dim(image.labels, i, size - 1 + i, axis=axis).reshape(-1).astype(jnp.int32) for i in (0, 1)
+        )
+        close = (apart.reshape(-1) < jump) & (first >= 0) & (second >= 0) & (first != second)
+        low, high = jnp.minimum(first, second), jnp.maximum(first, second)
+        pair = jnp.where(close, low * SLOTS + high, 0)
+        total = total + jnp.zeros(SLOTS * SLOTS).at[pair].add(close * 1.0).reshape(SLOTS, SLOTS)
+    return total
+
+
+def fitted(
+    key: Array,
+    image: LabelledImage,
+    masks: Bool[Array, "c h w"],
+    active: Bool[Array, " c"],
+    shapes: ShapeNetwork,
+    camera: Camera,
+    shelf: Shelf,
+    refinement: RefinementConfig,
+) -> Superquadrics:
+    """The object of every mask that is active: the network's, refined; fields (C, ...)."""
+    network = shapes.network
+
+    def fit(shared, element, row):
+        parameters, camera, shelf = shared
+        points, depth, labels = element
+        mask, seed = row
+        alone = jnp.where(mask, 0, jnp.where(labels >= 0, labels + 1, labels)).astype(jnp.int8)
+        scene = recognise(jax.random.key(seed), network, parameters, camera, points, alone, shelf, 1)
+        refined = refine(camera, shelf, scene, points.reshape(-1, 3), alone.reshape(-1), depth, refinement).scene
+        return jax.tree.map(lambda a: a[0], refined)
+
+    seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
+    shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
+    return masked_vmap(fit, active, shared, element, (masks, seeds), block=2)
