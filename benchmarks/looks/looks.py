@@ -37,9 +37,8 @@ from mechsearch_jax.envs.cell.simulated_cell import SensorNoise, SimulatedCell
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.noise import TimeOfFlight, depth_of
-from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import Thing
-from mechsearch_jax.perception.explanation import ExplanationConfig
+from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.scores import EDGE, intersection_over_union, sharpened
 from mechsearch_jax.problem.workcell import Workcell
@@ -181,7 +180,7 @@ class Bench:
         the true masks beside them.
       seed: of the noise and of the recogniser.
       workcell: camera and shelf; its target is what the recogniser knows.
-      explanation: of "explained" segments.
+      fitter: of "explained" segments.
     """
 
     pictures: Mapping[str, tuple[Scenario, Picture]]
@@ -189,7 +188,7 @@ class Bench:
     segments: Segments = "explained"
     seed: int = 0
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
-    explanation: ExplanationConfig = dataclasses.field(default_factory=ExplanationConfig)
+    fitter: Fitter = dataclasses.field(default_factory=Explaining)
 
     def __post_init__(self):
         if not self.pictures or not self.noises:
@@ -201,15 +200,15 @@ class Bench:
         Args:
           on_progress: called after every look with the number of looks so far.
         """
-        recogniser = Recogniser(self.workcell, explanation=self.explanation if self.segments == "explained" else None)
-        first = self.look(recogniser, next(iter(self.pictures)), self.noises[0])[2]
+        recogniser = Recogniser(self.workcell, fitter=self.fitter if self.segments == "explained" else as_segmented)
+        first = self.look(recogniser, next(iter(self.pictures)), self.noises[0])[1]
         rows: list[Row] = []
         phantoms: list[Phantom] = []
         seconds: list[float] = []
         for noise in self.noises:
             for name in self.pictures:
-                observation, segments, spent = self.look(recogniser, name, noise)
-                scored, extra = judged(*self.pictures[name], noise, observation, segments, recogniser.view.of)
+                fitted, spent = self.look(recogniser, name, noise)
+                scored, extra = judged(*self.pictures[name], noise, fitted, recogniser.view.of)
                 rows += scored
                 phantoms += extra
                 seconds.append(spent)
@@ -225,8 +224,8 @@ class Bench:
         compiling = max(first - statistics.median(seconds), 0.0)
         return Measured(tuple(rows), tuple(phantoms), tuple(seconds), compiling, settings, versions())
 
-    def look(self, recogniser: Recogniser, name: str, noise: str) -> tuple[Observation, Int[np.ndarray, "h w"], float]:
-        """One look: the observation, the labels of the recogniser's view, and its time [s]."""
+    def look(self, recogniser: Recogniser, name: str, noise: str) -> tuple[Fitted, float]:
+        """One look: what the recogniser made of the image, and its time [s]."""
         index = list(self.pictures).index(name)
         picture = self.pictures[name][1]
         depth = noisy(self.workcell, picture, noise, self.seed * 100_003 + index)
@@ -236,16 +235,15 @@ class Bench:
             masks = {"mask": np.where(shown, picture.owner, -2).astype(np.int8), "target_id": TARGET}
         key = jax.random.fold_in(jax.random.key(self.seed), index)
         start = time.perf_counter()
-        observation, image = jax.block_until_ready(recogniser.explained(key, depth, **masks))
-        return observation, np.asarray(image.labels), time.perf_counter() - start
+        fitted, _ = jax.block_until_ready(recogniser.fitted(key, depth, **masks))
+        return fitted, time.perf_counter() - start
 
 
 def judged(
     scenario: Scenario,
     picture: Picture,
     noise: str,
-    observation: Observation,
-    segments: Int[np.ndarray, "h w"],
+    fitted: Fitted,
     view: Callable[[Any], Any],
 ) -> tuple[list[Row], list[Phantom]]:
     """The outcomes of a look.
@@ -253,13 +251,12 @@ def judged(
     Args:
       scenario, picture: the truth.
       noise: its name.
-      observation: without batch axes.
-      segments: the labels of the recogniser's view, of which label i is object i.
+      fitted: what was made of it, without batch axes.
       view: cuts the recogniser's view out of an image.
     """
     bodies: list[Body] = [*scenario.objects, scenario.target]
     slots = [*range(len(scenario.objects)), TARGET]
-    objects = observation.objects
+    objects, segments, confidence = fitted.objects, np.asarray(fitted.labels), np.asarray(fitted.confidence)
     answers = np.flatnonzero(np.asarray(objects.valid))
     iou = np.asarray(_volumes(superquadrics(bodies, TARGET + 1), objects))[: len(bodies), answers]
     places = np.array([body.position for body in bodies])
@@ -297,10 +294,12 @@ def judged(
                 centre=None if centre is None else round(centre, 4),
                 angle=None if angle is None else round(angle, 1),
                 iou=0.0 if answer is None else round(float(iou[i, chosen[i]]), 4),
+                confidence=None if answer is None else round(float(confidence[answer]), 4),
             )
         )
     phantoms = [
-        Phantom(scenario.name, noise, int(a), phantom_kind(int(a), owner, segments)) for a in answers[~stands_for_one]
+        Phantom(scenario.name, noise, int(a), phantom_kind(int(a), owner, segments), round(float(confidence[a]), 4))
+        for a in answers[~stands_for_one]
     ]
     return rows, phantoms
 

@@ -52,6 +52,7 @@ class Row:
       centre: distance of the centres [m]; None if missing.
       angle: by which it is turned, but for the shape's symmetries [degrees]; None if missing.
       iou: intersection over union of the volumes; 0 if missing.
+      confidence: of the recognised object; None if missing.
     """
 
     scene: str
@@ -67,6 +68,7 @@ class Row:
     centre: float | None
     angle: float | None
     iou: float
+    confidence: float | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,12 +79,14 @@ class Phantom:
       scene, noise: of the look.
       slot: of the recognised object.
       kind: "split" if its segment lies mostly on one body, else "other".
+      confidence: of it.
     """
 
     scene: str
     noise: str
     slot: int
     kind: str
+    confidence: float
 
 
 def thing_of(name: str, body: Body) -> Thing:

@@ -24,8 +24,8 @@ from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.explanation import ExplanationConfig, explained_image
-from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
+from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
@@ -74,7 +74,7 @@ class Recogniser:
       shapes: the recognition network.
       detector: finds the target's pixels in a colour image.
       refinement: how the network's shapes are fitted to the depth image.
-      explanation: how segments of images without a mask are split, joined and dropped; None to keep them.
+      fitter: fits objects to the segments of images without a mask.
     """
 
     camera: Camera
@@ -85,7 +85,7 @@ class Recogniser:
     shapes: ShapeNetwork
     detector: TargetDetector
     refinement: RefinementConfig
-    explanation: ExplanationConfig | None
+    fitter: Fitter
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class Recogniser:
         weights: Weights | None = None,
         detector: TargetDetector | None = None,
         refinement: RefinementConfig | None = None,
-        explanation: ExplanationConfig | None = None,
+        fitter: Fitter | None = None,
     ):
         """Set up recognition for a problem.
 
@@ -107,7 +107,8 @@ class Recogniser:
           weights: of the recognition network; by default the package's.
           detector: by default for a red target in any light, `TargetColour.lit()`.
           refinement: the default if None.
-          explanation: how segments are split, joined and dropped; None, the default, to keep the segmenter's.
+          fitter: by default `Explaining()`, which splits, joins and drops segments where that explains the image
+            better; `as_segmented` keeps the segmenter's. Segments of a mask are always kept.
 
         Raises:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
@@ -123,7 +124,7 @@ class Recogniser:
             "shapes": ShapeNetwork.of(weights),
             "detector": _as_pytree(detector or TargetColour.lit()),
             "refinement": refinement or RefinementConfig(),
-            "explanation": explanation,
+            "fitter": fitter or Explaining(),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -138,12 +139,12 @@ class Recogniser:
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         data = (self.segmenter, self.shapes, self.detector, self.camera, self.view, self.shelf)
-        return data, (self.target, self.refinement, self.explanation)
+        return data, (self.target, self.refinement, self.fitter)
 
     @classmethod
     def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
         made = object.__new__(cls)
-        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf", "target", "refinement", "explanation")
+        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf", "target", "refinement", "fitter")
         for name, value in zip(names, (*leaves, *static), strict=True):
             object.__setattr__(made, name, value)
         return made
@@ -180,12 +181,13 @@ class Recogniser:
         Raises:
           InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
-        return self.explained(key, depth, colour, mask, target_id)[0]
+        fitted, visible = self.fitted(key, depth, colour, mask, target_id)
+        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence)
 
-    def explained(
+    def fitted(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
-    ) -> tuple[Observation, LabelledImage]:
-        """The observation, and the labelled image of the view that explains it: the pixels of label i show object i.
+    ) -> tuple[Fitted, Bool[Array, ""]]:
+        """What was made of the view of the images, with the pixels of each object, and whether the target is visible.
 
         Args:
           key, depth, colour, mask, target_id: as above.
@@ -196,23 +198,9 @@ class Recogniser:
         check_images(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
-        if mask is None and self.explanation is not None:
-            explained, target_pose = explained_image(
-                jnp.concatenate([keys[1:], jax.random.fold_in(key, 3)[None]]),
-                image,
-                self.shapes,
-                self.view.camera,
-                self.shelf,
-                self.target,
-                self.refinement,
-                self.explanation,
-            )
-            return Observation(explained.scene, visible, target_pose), image.replace(labels=explained.labels)
-        # Compiled separately, since it does not depend on where the labels come from.
-        objects, target_pose = recognise_image(
-            keys[1:], image, self.shapes, self.view.camera, self.shelf, self.target, self.refinement
-        )
-        return Observation(objects, visible, target_pose), image
+        fitter = self.fitter if mask is None else as_segmented
+        settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
+        return fitter(keys[1:], image, *settings), visible
 
 
 def _as_pytree(slot: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any, Protocol, cast
 
 import flax.struct
@@ -19,6 +20,9 @@ from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_netw
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
+
+# Parts of a cloud in which the nearest point is sought, if they are of equal size.
+_PARTS = 64
 
 
 class Segmenter(Protocol):
@@ -132,12 +136,16 @@ def spread_labels(
     """
     measured = jnp.isfinite(points).all(axis=-1)
     pixels = jnp.where(measured[..., None], points, 0.0).reshape(-1, 3)
+    parts = math.gcd(cloud.shape[0], _PARTS)
 
     def nearest(_, image, pixel):
         cloud, labels = image
-        square = _squares(pixel[None], cloud)[0]
-        best = jnp.argmin(square)
-        return jnp.where(square[best] < reach**2, labels[best], OTHER).astype(jnp.int8)
+        square = _squares(pixel[None], cloud)[0].reshape(parts, -1)
+        # On a CPU the minimum of each part is vectorised, which `argmin` is not.
+        least = jnp.min(square, axis=1)
+        part = jnp.argmin(least)
+        best = part * square.shape[1] + jnp.argmin(square[part])
+        return jnp.where(least[part] < reach**2, labels[best], OTHER).astype(jnp.int8)
 
     # Most of an image shows the shelf.
     wanted = (measured & candidates).reshape(-1)

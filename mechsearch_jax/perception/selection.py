@@ -1,0 +1,237 @@
+"""Choose the objects that account for an image at the least cost: points on no object, rays through one, overlaps."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.images.cloud import draw
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.hypotheses import SLOTS, WAYS
+from mechsearch_jax.perception.recognition import LabelledImage
+from mechsearch_jax.perception.refinement import FAR
+from mechsearch_jax.perception.solids import entries, penetrations, surface_distance
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.camera import Camera, pixel_rays
+
+
+@dataclasses.dataclass(frozen=True)
+class Costs:
+    """What an explanation costs; lengths in metres, costs in view pixels.
+
+    Attributes:
+      points: number of points that an explanation is judged by.
+      rays: at most about so many rays, spread evenly over the view.
+      exact: a point this near to an object's surface is explained, or one that is so many times as near as ...
+      deviations: ... the median of the points of the segments.
+      wrong: a point that is farther by this is not; between the two its cost grows evenly.
+      shrink: rays may pass this deep below an object's faces.
+      object: price of an object.
+      gain: by how much another explanation must be better, and ...
+      gain_share: ... by which share of the pixels of the segments that it changes.
+      overlap: objects may be so deep in each other, and in the target; recognition's own error.
+      overlap_cost: of each further centimetre.
+    """
+
+    points: int = 4096
+    rays: int = 16384
+    exact: float = 0.003
+    deviations: float = 2.5
+    wrong: float = 0.005
+    shrink: float = 0.005
+    object: float = 8.0
+    gain: float = 4.0
+    gain_share: float = 0.01
+    overlap: float = 0.01
+    overlap_cost: float = 20.0
+
+    def __post_init__(self):
+        check_positive(self)
+
+
+def check_positive(config: Costs) -> None:
+    """Check that all numbers of a configuration are positive.
+
+    Raises:
+      InputError: one is not.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{type(config).__name__}: {field.name} ({value}) must be positive")
+
+
+class Sample(flax.struct.PyTreeNode):
+    """Points and rays that an explanation is judged by.
+
+    Attributes:
+      points: of things on the board [m], shape (M, 3).
+      label: of each point.
+      weight: pixels for each point.
+      origin: of the rays, shape (3,).
+      directions: of rays, shape (R, 3).
+      free: length up to which each ray is free; 0 if nothing was measured.
+      exact: a point this near to a surface is explained [m].
+      ray_weight: pixels for each ray; static.
+    """
+
+    points: jax.Array
+    label: jax.Array
+    weight: jax.Array
+    origin: jax.Array
+    directions: jax.Array
+    free: jax.Array
+    exact: jax.Array
+    ray_weight: float = flax.struct.field(pytree_node=False)
+
+
+def sample_of(key: Array, image: LabelledImage, base: Superquadrics, camera: Camera, costs: Costs) -> Sample:
+    """Points and rays of an image; `base` are the objects of its segments."""
+    things = (image.labels != FREE) & (image.labels != MISSING) & ~image.of_target
+    index, total = draw(key, things.reshape(-1), costs.points)
+    height, width = image.labels.shape
+    step = max(1, math.ceil(math.sqrt(height * width / costs.rays)))
+    rows, columns = (jnp.arange(step // 2, size, step) for size in (height, width))
+    seen = image.depth[rows[:, None], columns[None, :]].reshape(-1)
+    grid = jnp.meshgrid(rows * 1.0, columns * 1.0, indexing="ij")
+    free = jnp.where(jnp.isnan(seen), 0.0, jnp.minimum(seen, FAR))
+    label = jnp.where(total > 0, image.labels.reshape(-1)[index], OTHER).astype(jnp.int32)
+    points = jnp.where(total > 0, image.points.reshape(-1, 3)[index], 0.0)
+    own = jnp.abs(surface_distance(base, points))[jnp.maximum(label, 0), jnp.arange(costs.points)]
+    usual = jnp.nanmedian(jnp.where((label >= 0) & base.valid[jnp.maximum(label, 0)], own, jnp.nan))
+    return Sample(
+        points=points,
+        label=label,
+        weight=total / costs.points,
+        origin=jnp.array(camera.position),
+        directions=pixel_rays(camera, *grid).reshape(-1, 3),
+        free=free,
+        exact=jnp.maximum(costs.exact, costs.deviations * jnp.nan_to_num(usual)),
+        ray_weight=float(step**2),
+    )
+
+
+def point_cost(distance: Array, sample: Sample, costs: Costs) -> Array:
+    """0 for a point on a surface, 1 for one that is far from it."""
+    return jnp.clip((jnp.abs(distance) - sample.exact) / costs.wrong, 0.0, 1.0)
+
+
+def passed(scene: Superquadrics, sample: Sample, costs: Costs) -> Float[Array, " n"]:
+    """Number of pixels whose measured rays pass through each object."""
+    enter = entries(scene, sample.origin, sample.directions, costs.shrink)
+    return jnp.sum(enter < sample.free[None] - costs.shrink, axis=1) * sample.ray_weight
+
+
+class Moves(flax.struct.PyTreeNode):
+    """Changes of an explanation, each from one set of objects to another, shape (Q, C), and which are possible.
+
+    The objects are those of the segments, both parts of every division, the unions, and the target.
+    """
+
+    removed: jax.Array
+    added: jax.Array
+    possible: jax.Array
+
+
+def moves_of(
+    chosen: Int[Array, " k"],
+    divided: Bool[Array, " d"],
+    pair: tuple[Array, Array],
+    joined: Bool[Array, " m"],
+) -> Moves:
+    """Divide a segment into two objects or one of them, join a pair, or drop an object; the target stays.
+
+    Args:
+      chosen: segments that are divided, each in `WAYS` ways.
+      divided: which of the divisions are tried.
+      pair: first and second segment of each union.
+      joined: which of the unions are tried.
+    """
+    count = len(divided)
+    capacity = SLOTS + 2 * count + len(joined) + 1
+    of_segment = jax.nn.one_hot(jnp.repeat(chosen, WAYS), capacity, dtype=bool)
+    one, other = (jax.nn.one_hot(SLOTS + 2 * jnp.arange(count) + i, capacity, dtype=bool) for i in (0, 1))
+    merged = [jax.nn.one_hot(slots, capacity, dtype=bool) for slots in pair]
+    union = jax.nn.one_hot(SLOTS + 2 * count + jnp.arange(len(joined)), capacity, dtype=bool)
+    each = jnp.eye(capacity, dtype=bool)[:-1]
+    return Moves(
+        removed=jnp.concatenate([of_segment, of_segment, of_segment, merged[0] | merged[1], each]),
+        added=jnp.concatenate([one | other, one, other, union, jnp.zeros_like(each)]),
+        possible=jnp.concatenate([divided, divided, divided, joined, jnp.ones(len(each), bool)]),
+    )
+
+
+class Selection(flax.struct.PyTreeNode):
+    """The objects that explain an image at the least cost.
+
+    Attributes:
+      selected: which objects, shape (C,).
+      margin: by how many pixels each object is better than what would stand for it otherwise, shape (C,); infinite
+        where nothing was tried.
+    """
+
+    selected: jax.Array
+    margin: jax.Array
+
+
+def select_objects(
+    scene: Superquadrics, moves: Moves, sample: Sample, pixels: Int[Array, " 8"], costs: Costs
+) -> Selection:
+    """Which objects explain the image at the least cost, by the best change at a time from those of the segments.
+
+    Args:
+      scene: the objects, in the order of `Moves`.
+      moves, sample: of the image.
+      pixels: of the segments.
+      costs: static.
+    """
+    capacity = scene.capacity
+    of_target = jnp.arange(capacity) == capacity - 1
+    cost = jnp.where(scene.valid[:, None], point_cost(surface_distance(scene, sample.points), sample, costs), 1.0)
+    price = jnp.where(of_target, 0.0, costs.object + passed(scene, sample, costs))
+    overlap = costs.overlap_cost * 100.0 * jnp.maximum(penetrations(scene) - costs.overlap, 0.0)
+
+    # What a change must gain, for those that begin with a segment.
+    size = jnp.concatenate([pixels, jnp.zeros(capacity - SLOTS)])
+    needed = costs.gain + costs.gain_share * jnp.sum(moves.removed * size[None], axis=1)
+    table = (cost, price, overlap, sample.weight)
+
+    def gains_from(selected, present):
+        after = (selected[None] & ~moves.removed) | (moves.added & scene.valid[None])
+        possible = moves.possible & jnp.all(~moves.removed | selected[None], axis=1)
+        possible &= jnp.all(~moves.added | scene.valid[None], axis=1)
+        possible &= jnp.sum(after & ~of_target[None], axis=1) <= SLOTS
+        costs_after = masked_vmap(lambda _, table, row: _total(table, row), possible, None, table, after, block=1)
+        return after, jnp.where(possible, present - costs_after, -jnp.inf)
+
+    def step(state):
+        selected, present, _, rounds, margin, _ = state
+        after, gains = gains_from(selected, present)
+        best = jnp.argmax(gains - needed)
+        better = gains[best] > needed[best]
+        margin = jnp.where(better & moves.added[best], jnp.minimum(margin, gains[best]), margin)
+        selected = jnp.where(better, after[best], selected)
+        return selected, jnp.where(better, present - gains[best], present), better, rounds + 1, margin, gains
+
+    start = scene.valid & ((jnp.arange(capacity) < SLOTS) | of_target)
+    unlimited, nothing = jnp.full(capacity, jnp.inf), jnp.full(len(needed), -jnp.inf)
+    state = (start, _total(table, start), jnp.array(True), 0, unlimited, nothing)
+    selected, _, _, _, margin, gains = jax.lax.while_loop(lambda state: state[2] & (state[3] < SLOTS), step, state)
+    left = jnp.min(jnp.where(moves.removed, -gains[:, None], jnp.inf), axis=0)
+    return Selection(selected, jnp.minimum(margin, left))
+
+
+def _total(table: tuple[Array, Array, Array, Array], selected: Bool[Array, " c"]) -> Array:
+    """The cost of an explanation; `table` has each object's cost of each point, its price, its overlaps, and a point's
+    number of pixels."""
+    cost, price, overlap, weight = table
+    left = jnp.min(jnp.where(selected[:, None], cost, 1.0), axis=0)
+    both = jnp.sum(jnp.where(selected[:, None] & selected[None], overlap, 0.0)) / 2.0
+    return jnp.sum(left) * weight + jnp.sum(jnp.where(selected, price, 0.0)) + both
