@@ -87,7 +87,7 @@ def test_a_bench_of_nothing_is_refused():
 def test_true_segments_of_a_simple_scene_are_all_right():
     scenario = load_scenario(example_scenarios()["first-light"])
     picture = looks.taken(Workcell(), scenario)
-    measured = looks.Bench({scenario.name: (scenario, picture)}, ("clean",), "true").run()
+    measured = looks.Bench({scenario.name: (scenario, picture)}, ("clean",), ("true",)).run()
     everything = measured.summary()[0]
     assert everything["wrong"] == everything["phantoms"] == 0
     assert everything["objects"] == len(measured.rows) == sum(row.pixels >= scoring.PIXELS for row in measured.rows)

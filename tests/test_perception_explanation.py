@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.images.cloud import above_board, thinned_view
-from mechsearch_jax.images.labels import FREE
-from mechsearch_jax.perception.explanation import ExplanationConfig, explained_image
+from mechsearch_jax.images.labels import FREE, OTHER
+from mechsearch_jax.perception.confidence import Measures, confidence_of
+from mechsearch_jax.perception.explanation import Explaining, ExplanationConfig
+from mechsearch_jax.perception.hypotheses import SLOTS, WAYS, distinct
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
+from mechsearch_jax.perception.selection import Costs, moves_of, sample_of, select_objects
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, rays
 from mechsearch_jax.workspace.render import object_depth
@@ -49,9 +52,9 @@ def explained():
     def explain(*segments):
         labels = np.where(shown >= 0, np.array(segments)[np.maximum(shown, 0)], shown).astype(np.int8)
         image = LabelledImage(points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.asarray(none))
-        keys, target = jax.random.split(jax.random.key(0), 3), Target.of("cylinder")
-        settings = shapes, camera, SHELF, target, RefinementConfig(), ExplanationConfig()
-        return labels, explained_image(keys, image, *settings)[0]
+        keys, target = jax.random.split(jax.random.key(0)), Target.of("cylinder")
+        settings = shapes, camera, SHELF, target, RefinementConfig()
+        return labels, Explaining()(keys, image, *settings)
 
     return explain
 
@@ -68,15 +71,101 @@ def test_right_segments_stay_and_two_in_one_are_split(explained):
     labels, right = explained(0, 1, 2)
     np.testing.assert_array_equal(right.labels, labels)
     assert not np.asarray(right.changed).any()
-    errors, count = found(right.scene)
+    errors, count = found(right.objects)
     assert errors.max() < 0.01
     assert count == 3
 
     _, split = explained(0, 0, 2)
-    errors, count = found(split.scene)
+    errors, count = found(split.objects)
     assert errors.max() < 0.02
     assert count == 3
     assert np.asarray(split.changed).sum() == 2
+    assert (np.asarray(right.confidence) > 0.9).tolist() == np.asarray(right.objects.valid).tolist()
+
+    # What the segmenter gave to no object, such as a target that is not detected, is given to none.
+    labels, rest = explained(0, 1, OTHER)
+    np.testing.assert_array_equal(np.asarray(rest.labels)[labels == OTHER], OTHER)
+    assert found(rest.objects)[1] == 2
+
+
+BOX = (0.03, 0.03, 0.05)
+
+
+def selection(bodies, shown, unions=(), target=None):
+    """What is selected of bodies for the first segments and for the first unions, in an image of the bodies `shown`."""
+    count = 2 * WAYS
+    scene = superquadrics([*bodies], SLOTS + count + len(unions) + 1)
+    absent = np.arange(scene.capacity) >= len(bodies)
+    scene = scene.replace(valid=jnp.asarray(~absent))
+    for i, body in [*enumerate(unions, SLOTS + count), *([(scene.capacity - 1, target)] if target else [])]:
+        alone = superquadrics([body])
+        scene = jax.tree.map(lambda a, b, i=i: a.at[i].set(b[0]), scene, alone)
+    camera, directions = VIEW.camera, rays(VIEW.camera)
+    truth = superquadrics(shown)
+    origin = jnp.array(camera.position)
+    depth = np.min(
+        [object_depth(jax.tree.map(lambda a, i=i: a[i], truth), origin, directions) for i in range(len(shown))], 0
+    )
+    points = back_project(camera, jnp.asarray(np.where(np.isfinite(depth), depth, np.nan), jnp.float32))
+    shows = np.isfinite(depth)
+    labels = np.where(shows, 0, FREE).astype(np.int8)
+    image = LabelledImage(points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.zeros(depth.shape, bool))
+    costs = Costs()
+    base = jax.tree.map(lambda a: a[:SLOTS], scene)
+    sample = sample_of(jax.random.key(0), image, base, camera, costs)
+    pair = jnp.zeros(len(unions), int), jnp.ones(len(unions), int)
+    moves = moves_of(jnp.zeros(1, int), jnp.zeros(WAYS, bool), pair, jnp.ones(len(unions), bool))
+    pixels = jnp.zeros(SLOTS, int).at[0].set(int(shows.sum()))
+    chosen = select_objects(scene, moves, sample, pixels, costs)
+    return np.flatnonzero(chosen.selected).tolist(), np.asarray(chosen.margin)
+
+
+def test_a_phantom_in_an_object_is_dropped():
+    kept, margin = selection([box(0.0, 0.0, BOX)], [box(0.0, 0.0, BOX)])
+    assert kept == [0]
+    # Without it, its pixels would be unexplained.
+    assert margin[0] > 100.0
+    # The second box explains nothing that the first one does not.
+    assert selection([box(0.0, 0.0, BOX), box(0.005, 0.0, BOX)], [box(0.0, 0.0, BOX)])[0] == [0]
+
+
+def test_the_target_is_priced_like_an_object():
+    shown = [box(0.0, 0.0, BOX)]
+    target = box(0.035, 0.0, BOX)
+    end = SLOTS + 2 * WAYS
+    kept, free = selection([box(0.0, 0.0, BOX)], shown, target=box(0.2, 0.0, BOX))
+    assert kept == [0, end]
+    kept, deep = selection([box(0.0, 0.0, BOX)], shown, target=target)
+    assert kept == [0, end]
+    # 2.5 cm in the target, of which 1 cm is recognition's own error, at 20 pixels a centimetre.
+    assert free[0] - deep[0] == pytest.approx(30.0, abs=5.0)
+
+
+def test_two_objects_in_one_another_become_one():
+    whole = box(0.0, 0.0, (0.03, 0.08, 0.05))
+    parts = [box(0.0, -0.03, (0.03, 0.05, 0.05)), box(0.0, 0.03, (0.03, 0.05, 0.05))]
+    assert selection(parts, [whole], unions=[whole])[0] == [SLOTS + 2 * WAYS]
+
+
+def test_ways_that_divide_a_segment_alike_are_one():
+    first = np.zeros((1, WAYS, 10, 10), bool)
+    first[0, 0, :5] = True
+    # The other half, and half of it.
+    first[0, 1, 5:] = True
+    first[0, 2, :3] = True
+    assert distinct(jnp.asarray(first), jnp.array([100])).tolist() == [[True, False, True]]
+
+
+def test_confidence_falls_with_what_is_measured():
+    """Each measure alone makes an object less sure; an absent object has no confidence."""
+    sure = {"valid": True, "pixels": 500, "misfit": 0.0, "error": 0.001, "margin": np.inf}
+    worse = {"misfit": 0.2, "error": 0.02, "margin": 5.0, "valid": False}
+    rows = [sure, *({**sure, name: value} for name, value in worse.items())]
+    measures = Measures(**{name: jnp.array([row[name] for row in rows]) for name in sure})
+    best, *others = np.asarray(confidence_of(measures)).tolist()
+    assert 0.99 < best < 1.0
+    assert all(other < best for other in others)
+    assert others[-1] == 0.0
 
 
 def test_impossible_settings_are_refused():

@@ -7,6 +7,8 @@ Its objects are compared with the true bodies.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import statistics
 import time
 from collections import Counter
@@ -48,8 +50,18 @@ from mechsearch_jax.workspace.scenario import Body, Scenario, superquadrics
 
 NoiseName = Literal["clean", "gaussian", "time-of-flight"]
 Segments = Literal["network", "explained", "true"]
+# What fits objects, by the segments.
+FITTERS: Mapping[Segments, Fitter] = {"network": as_segmented, "explained": Explaining(), "true": as_segmented}
 # Ranges of pixels by which objects are counted: name, from, to below.
 SIZES = (("100 to 1000", 100, 1000), ("1000 to 5000", 1000, 5000), ("5000 and more", 5000, np.inf))
+
+# Ranges of stated confidences by which recognised objects are counted.
+CONFIDENCES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 1.01)
+TIMES: Mapping[str, Callable[[Any], Any]] = {
+    "median": np.median,
+    "95th percentile": functools.partial(np.percentile, q=95),
+    "largest": np.max,
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,24 +120,25 @@ class Measured:
     Attributes:
       rows: one for every visible object of every look.
       phantoms: of all looks.
-      seconds: of each look, from image to observation [s].
-      compile_seconds: of the first look, minus the median of the others [s].
+      seconds: of each look, from image to observation, by the segments [s].
+      compile_seconds: of the first look, minus the median of the others, by the segments [s].
       settings: scenes, noises, segments and seed.
       versions: as `versions` returns them.
     """
 
     rows: tuple[Row, ...]
     phantoms: tuple[Phantom, ...]
-    seconds: tuple[float, ...]
-    compile_seconds: float
+    seconds: dict[str, tuple[float, ...]]
+    compile_seconds: dict[str, float]
     settings: dict[str, Any]
     versions: dict[str, str]
 
     def summary(self) -> list[dict[str, Any]]:
-        """Counts by noise: of all objects, by pixels, by contact and by number of objects."""
+        """Counts by segments and noise: of all objects, by pixels, by contact and by number of objects."""
         lines = []
-        for noise in dict.fromkeys(row.noise for row in self.rows):
-            rows = [row for row in self.rows if row.noise == noise]
+        for segments, noise in dict.fromkeys((row.segments, row.noise) for row in self.rows):
+            rows = [row for row in self.rows if (row.segments, row.noise) == (segments, noise)]
+            phantoms = [p for p in self.phantoms if (p.segments, p.noise) == (segments, noise)]
             groups: dict[str, Sequence[Row]] = {"all": rows}
             groups |= {f"{name} pixels": [r for r in rows if low <= r.pixels < high] for name, low, high in SIZES}
             groups["touching"] = [row for row in rows if row.gap < TOUCHING]
@@ -133,13 +146,34 @@ class Measured:
             groups["apart"] = [row for row in rows if row.gap >= TOUCHING and not row.beside]
             counts = sorted({row.objects for row in rows})
             groups |= {f"{count} objects": [row for row in rows if row.objects == count] for count in counts}
-            lines += [{"noise": noise, "group": name} | figures(chosen) for name, chosen in groups.items() if chosen]
-            phantoms = [phantom for phantom in self.phantoms if phantom.noise == noise]
-            lines[-len([g for g in groups.values() if g])] |= {
+            kind = {"segments": segments, "noise": noise}
+            everything = {
                 "looks": len({row.scene for row in rows}),
                 "phantoms": len(phantoms),
                 "phantom_kinds": dict(Counter(phantom.kind for phantom in phantoms)),
             }
+            lines += [kind | {"group": name} | figures(chosen) for name, chosen in groups.items() if chosen]
+            lines[-sum(map(bool, groups.values()))] |= everything
+        return lines
+
+    def reliability(self) -> list[dict[str, Any]]:
+        """How often recognised objects are not right, phantoms included, by segments, noise and stated confidence."""
+        lines = []
+        for segments, noise in dict.fromkeys((row.segments, row.noise) for row in self.rows):
+            kind = (segments, noise)
+            stated = [
+                (row.confidence, row.outcome != "right")
+                for row in self.rows
+                if (row.segments, row.noise) == kind and row.confidence is not None
+            ]
+            stated += [(p.confidence, True) for p in self.phantoms if (p.segments, p.noise) == kind]
+            for low, high in itertools.pairwise(CONFIDENCES):
+                wrong = [is_wrong for confidence, is_wrong in stated if low <= confidence < high]
+                mean = [confidence for confidence, _ in stated if low <= confidence < high]
+                if wrong:
+                    line = {"from": low, "to": min(high, 1.0), "objects": len(wrong), "wrong": sum(wrong)}
+                    expected = round(float(np.sum(1.0 - np.array(mean))), 2)
+                    lines.append({"segments": segments, "noise": noise, **line, "expected_wrong": expected})
         return lines
 
     def value(self) -> dict[str, Any]:
@@ -147,9 +181,13 @@ class Measured:
         return {
             "settings": self.settings,
             "versions": self.versions,
-            "median_seconds": statistics.median(self.seconds),
+            "seconds": {
+                segments: {name: round(float(of(times)), 4) for name, of in TIMES.items()}
+                for segments, times in self.seconds.items()
+            },
             "compile_seconds": self.compile_seconds,
             "summary": self.summary(),
+            "reliability": self.reliability(),
             "wrong": [dataclasses.asdict(row) for row in self.rows if row.outcome != "right"],
             "phantoms": [dataclasses.asdict(phantom) for phantom in self.phantoms],
         }
@@ -176,61 +214,69 @@ class Bench:
     Attributes:
       pictures: images of scenes by name, each with its scenario.
       noises: of `NoiseName`.
-      segments: "explained" or "network" for depth images alone, with and without `perception.explanation`; "true" for
-        the true masks beside them.
+      segments: one or more of `Segments`: "explained" or "network" for depth images alone, with and without
+        `perception.explanation`; "true" for the true masks beside them.
       seed: of the noise and of the recogniser.
       workcell: camera and shelf; its target is what the recogniser knows.
-      fitter: of "explained" segments.
     """
 
     pictures: Mapping[str, tuple[Scenario, Picture]]
     noises: Sequence[str] = ("gaussian",)
-    segments: Segments = "explained"
+    segments: Sequence[Segments] = ("explained",)
     seed: int = 0
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
-    fitter: Fitter = dataclasses.field(default_factory=Explaining)
 
     def __post_init__(self):
-        if not self.pictures or not self.noises:
+        if not self.pictures or not self.noises or not self.segments:
             raise InputError("bench looks: there is nothing to look at; give scenes and at least one noise")
 
+    @property
+    def looks(self) -> int:
+        """Number of looks."""
+        return len(self.pictures) * len(self.noises) * len(self.segments)
+
     def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
-        """Look at everything.
+        """Look at everything, in turn with all segments, so that their times are of the same load of the machine.
 
         Args:
           on_progress: called after every look with the number of looks so far.
         """
-        recogniser = Recogniser(self.workcell, fitter=self.fitter if self.segments == "explained" else as_segmented)
-        first = self.look(recogniser, next(iter(self.pictures)), self.noises[0])[1]
+        recognisers: dict[Segments, Recogniser] = {
+            kind: Recogniser(self.workcell, fitter=FITTERS[kind]) for kind in self.segments
+        }
+        start = next(iter(self.pictures)), self.noises[0]
+        first = {kind: self.look(recogniser, kind, *start)[1] for kind, recogniser in recognisers.items()}
         rows: list[Row] = []
         phantoms: list[Phantom] = []
-        seconds: list[float] = []
-        for noise in self.noises:
-            for name in self.pictures:
-                fitted, spent = self.look(recogniser, name, noise)
-                scored, extra = judged(*self.pictures[name], noise, fitted, recogniser.view.of)
-                rows += scored
-                phantoms += extra
-                seconds.append(spent)
-                on_progress(len(seconds))
+        seconds: dict[Segments, list[float]] = {kind: [] for kind in recognisers}
+        for done, (noise, name, kind) in enumerate(itertools.product(self.noises, self.pictures, recognisers)):
+            fitted, spent = self.look(recognisers[kind], kind, name, noise)
+            scored, extra = judged(*self.pictures[name], (kind, noise), fitted, recognisers[kind].view.of)
+            rows += scored
+            phantoms += extra
+            seconds[kind].append(spent)
+            on_progress(done + 1)
         settings = {
             "scenes": len(self.pictures),
             "names": [min(self.pictures), max(self.pictures)],
             "noises": list(self.noises),
-            "segments": self.segments,
+            "segments": list(self.segments),
             "seed": self.seed,
             "least_pixels": PIXELS,
         }
-        compiling = max(first - statistics.median(seconds), 0.0)
-        return Measured(tuple(rows), tuple(phantoms), tuple(seconds), compiling, settings, versions())
+        compiling: dict[str, float] = {
+            kind: round(max(first[kind] - statistics.median(seconds[kind]), 0.0), 2) for kind in seconds
+        }
+        times: dict[str, tuple[float, ...]] = {kind: tuple(values) for kind, values in seconds.items()}
+        return Measured(tuple(rows), tuple(phantoms), times, compiling, settings, versions())
 
-    def look(self, recogniser: Recogniser, name: str, noise: str) -> tuple[Fitted, float]:
+    def look(self, recogniser: Recogniser, kind: Segments, name: str, noise: str) -> tuple[Fitted, float]:
         """One look: what the recogniser made of the image, and its time [s]."""
         index = list(self.pictures).index(name)
         picture = self.pictures[name][1]
         depth = noisy(self.workcell, picture, noise, self.seed * 100_003 + index)
         masks: dict[str, Any] = {}
-        if self.segments == "true":
+        if kind == "true":
             shown = (picture.owner >= 0) & (picture.owner <= TARGET)
             masks = {"mask": np.where(shown, picture.owner, -2).astype(np.int8), "target_id": TARGET}
         key = jax.random.fold_in(jax.random.key(self.seed), index)
@@ -242,7 +288,7 @@ class Bench:
 def judged(
     scenario: Scenario,
     picture: Picture,
-    noise: str,
+    kind: tuple[str, str],
     fitted: Fitted,
     view: Callable[[Any], Any],
 ) -> tuple[list[Row], list[Phantom]]:
@@ -250,7 +296,7 @@ def judged(
 
     Args:
       scenario, picture: the truth.
-      noise: its name.
+      kind: names of the segments and of the noise.
       fitted: what was made of it, without batch axes.
       view: cuts the recogniser's view out of an image.
     """
@@ -284,7 +330,8 @@ def judged(
                 scene=scenario.name,
                 object=slot,
                 objects=len(scenario.objects),
-                noise=noise,
+                segments=kind[0],
+                noise=kind[1],
                 shape=body.shape,
                 pixels=pixels,
                 gap=round(float(apart[i]), 4),
@@ -298,7 +345,7 @@ def judged(
             )
         )
     phantoms = [
-        Phantom(scenario.name, noise, int(a), phantom_kind(int(a), owner, segments), round(float(confidence[a]), 4))
+        Phantom(scenario.name, *kind, int(a), phantom_kind(int(a), owner, segments), round(float(confidence[a]), 4))
         for a in answers[~stands_for_one]
     ]
     return rows, phantoms

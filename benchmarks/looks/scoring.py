@@ -41,6 +41,7 @@ class Row:
       scene: name of the scene.
       object: its slot.
       objects: number of objects in the scene, seen or not.
+      segments: where its segment comes from.
       noise: name of the sensor.
       shape: name of its shape.
       pixels: number of pixels of the full image that show it.
@@ -58,6 +59,7 @@ class Row:
     scene: str
     object: int
     objects: int
+    segments: str
     noise: str
     shape: str
     pixels: int
@@ -76,13 +78,14 @@ class Phantom:
     """A recognised object that stands for no body.
 
     Attributes:
-      scene, noise: of the look.
+      scene, segments, noise: of the look.
       slot: of the recognised object.
       kind: "split" if its segment lies mostly on one body, else "other".
       confidence: of it.
     """
 
     scene: str
+    segments: str
     noise: str
     slot: int
     kind: str

@@ -33,7 +33,8 @@ from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
+from mechsearch_jax.perception.explanation import Explaining, Fitter, as_segmented
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
@@ -83,21 +84,24 @@ class ImageRecogniser:
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
+      fitter: fits objects to the labelled image.
     """
 
     target: Target
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
+    fitter: Fitter = as_segmented
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
+        unseen = found_pixels(snapshot.camera) / view.stride**2
         image = labelled(keys[0], self, view, shelf, snapshot.world, snapshot.target_seen, snapshot.sensing)
         shapes = ShapeNetwork.of(self.weights)
-        # Compiled on its own, whatever the labels come from.
-        objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
-        return Observation(objects, snapshot.target_seen, pose)
+        settings = (shapes, view.camera, shelf, self.target, self.refinement)
+        fitted = self.fitter(keys[2:], image, *settings, least=SAMPLED * unseen)
+        return Observation(fitted.objects, snapshot.target_seen, fitted.target_pose, fitted.confidence)
 
 
 @kept(static_argnames=("recogniser",))
@@ -159,6 +163,7 @@ class ColourRecogniser:
       noise: of the depth sensor.
       camera: of colours, where `Snapshot.sensing` says nothing.
       refinement: how recognised shapes are refined.
+      fitter: fits objects to the labelled image.
       detects_target: see `snapshot.Truth`.
     """
 
@@ -169,6 +174,7 @@ class ColourRecogniser:
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     camera: ColourSensing = dataclasses.field(default_factory=ColourSensing)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
+    fitter: Fitter = dataclasses.field(default_factory=Explaining)
     detects_target: bool = True
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
@@ -177,8 +183,9 @@ class ColourRecogniser:
         unseen = found_pixels(snapshot.camera) / view.stride**2
         image, seen = detected(keys[:2], self, view, shelf, snapshot.world, unseen, snapshot.sensing)
         shapes = ShapeNetwork.of(self.weights)
-        objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
-        return Observation(objects, seen, pose)
+        settings = (shapes, view.camera, shelf, self.target, self.refinement)
+        fitted = self.fitter(keys[2:], image, *settings, least=SAMPLED * unseen)
+        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence)
 
 
 def sighted(

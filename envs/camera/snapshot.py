@@ -181,7 +181,7 @@ def oracle(key: Array, snapshot: Snapshot) -> Observation:
 
     Of a camera that is not where the planner takes it to be, the poses are those that the planner sees.
     """
-    return Observation(_seen_objects(snapshot), snapshot.target_seen, snapshot.target_pose)
+    return Observation(_seen_objects(snapshot), snapshot.target_seen, snapshot.target_pose).judged()
 
 
 def informed(key: Array, snapshot: Snapshot) -> Observation:
@@ -190,7 +190,7 @@ def informed(key: Array, snapshot: Snapshot) -> Observation:
     An upper bound on searching: the target counts as visible in every observation, so that it is found from the start.
     Ignores the key.
     """
-    return Observation(_seen_objects(snapshot), jnp.array(True), snapshot.target_pose)
+    return Observation(_seen_objects(snapshot), jnp.array(True), snapshot.target_pose).judged()
 
 
 def _seen_objects(snapshot: Snapshot) -> Superquadrics:

@@ -1,9 +1,9 @@
-"""How sure each recognised object is, from how well it accounts for the depth image.
+"""How sure each recognised object is.
 
-Four things are measured for each object: the share of its pixels that do not lie on it or whose rays pass through it,
-how far its points are from its surface relative to the others', which share of its silhouette is seen, and by how much
-it is better than what would stand for its pixels otherwise. A logistic function of their logarithms, fitted on
-development scenes, gives the probability that the object is right (docs/experiments.md).
+Three things are measured for each object: how far the recognition network expects the centre to be from the true one,
+which share of its pixels does not lie on it or has rays that pass through it, and by how much it is better than what
+would stand for its pixels otherwise. A logistic function of their logarithms, fitted on development scenes, gives the
+probability that the object is right to 2 cm and 15 degrees (docs/experiments.md, "How sure a shape is").
 """
 
 from __future__ import annotations
@@ -17,7 +17,13 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception.hypotheses import SLOTS, pixels_of
 from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.selection import Costs, Sample, passed, point_cost
-from mechsearch_jax.perception.solids import entries, surface_distance
+from mechsearch_jax.perception.solids import surface_distance
+
+# Logarithm of the odds that an object is wrong: a constant, and by how much it grows with each logarithm.
+BIAS, PER_ERROR, PER_MISFIT, PER_MARGIN = 6.137, 1.271, 0.451, -0.164
+# Expected errors are limited to this range [m]; these shares are the least that count.
+ERRORS = (1e-4, 0.02)
+LEAST_MISFIT, LEAST_MARGIN = 0.01, 0.01
 
 
 class Measures(flax.struct.PyTreeNode):
@@ -27,17 +33,14 @@ class Measures(flax.struct.PyTreeNode):
       valid: whether there is an object.
       pixels: number of its pixels in the view.
       misfit: pixels that are badly explained, or whose rays pass through it, over its number of pixels.
-      residual: mean distance of its points from its surface, those that are farther than `Costs.exact` by `Costs.wrong`
-        counted as so far [m].
-      visible: share of its silhouette that its pixels are.
+      error: how far the network expects the centre to be from the true one [m].
       margin: by how many pixels it is better than another explanation; infinite if nothing else was tried.
     """
 
     valid: jax.Array
     pixels: jax.Array
     misfit: jax.Array
-    residual: jax.Array
-    visible: jax.Array
+    error: jax.Array
     margin: jax.Array
 
 
@@ -46,6 +49,7 @@ def measures_of(
     labels: Int[Array, "h w"],
     image: LabelledImage,
     sample: Sample,
+    error: Float[Array, " 8"],
     margin: Float[Array, " 8"],
     costs: Costs,
 ) -> Measures:
@@ -56,27 +60,26 @@ def measures_of(
       labels: the pixels of each object.
       image: its points.
       sample: rays of the image.
-      margin: see `Measures`.
+      error, margin: see `Measures`.
       costs: what a point or ray costs.
     """
     pixels = pixels_of(labels)
     own = labels.reshape(-1)[None] == jnp.arange(SLOTS)[:, None]
     flat = jnp.where(own.any(axis=0)[:, None], image.points.reshape(-1, 3), 0.0)
-    distance = jnp.abs(surface_distance(objects, flat))
-    count = jnp.maximum(pixels, 1)
-    badly = jnp.sum(jnp.where(own, point_cost(distance, sample, costs), 0.0), axis=1)
-    near = jnp.minimum(distance, sample.exact + costs.wrong)
-    silhouette = jnp.sum(jnp.isfinite(entries(objects, sample.origin, sample.directions)), axis=1) * sample.ray_weight
+    badly = jnp.sum(jnp.where(own, point_cost(surface_distance(objects, flat), sample, costs), 0.0), axis=1)
     return Measures(
         valid=objects.valid,
         pixels=pixels,
-        misfit=(badly + passed(objects, sample, costs)) / count,
-        residual=jnp.sum(jnp.where(own, near, 0.0), axis=1) / count,
-        visible=jnp.clip(pixels / jnp.maximum(silhouette, 1.0), 0.0, 1.0),
+        misfit=(badly + passed(objects, sample, costs)) / jnp.maximum(pixels, 1),
+        error=error,
         margin=margin,
     )
 
 
 def confidence_of(measures: Measures) -> Float[Array, " 8"]:
-    """The probability that each object is right; 0 for absent ones."""
-    return jnp.where(measures.valid, 1.0, 0.0)
+    """The probability that each object is right to 2 cm and 15 degrees; 0 for absent ones."""
+    error = jnp.log(jnp.clip(measures.error, *ERRORS))
+    misfit = jnp.log(measures.misfit + LEAST_MISFIT)
+    margin = jnp.log(jnp.clip(measures.margin / jnp.maximum(measures.pixels, 1), LEAST_MARGIN, 1.0))
+    odds = BIAS + PER_ERROR * error + PER_MISFIT * misfit + PER_MARGIN * margin
+    return jnp.where(measures.valid, jax.nn.sigmoid(-odds), 0.0)

@@ -23,7 +23,7 @@ from mechsearch_jax.geometry.transforms import yaw_rotation
 from mechsearch_jax.images.labels import MISSING, OTHER
 from mechsearch_jax.images.target_pixels import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.perception.confidence import Measures, confidence_of, measures_of
-from mechsearch_jax.perception.hypotheses import SLOTS, WAYS, bordering, fitted, parts, pixels_of
+from mechsearch_jax.perception.hypotheses import SLOTS, bordering, distinct, fitted, parts, pixels_of
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import (
@@ -51,10 +51,11 @@ class ExplanationConfig(Costs):
 
     Attributes:
       splits: number of the most doubtful segments that are divided.
-      merges: number of pairs of bordering segments that are joined.
+      merges: number of pairs of segments that are joined.
       doubtful: a segment is doubtful if so many of its pixels are badly explained, and ...
       doubtful_share: ... such a share of them.
-      touching: pairs are joined if one of them is doubtful, or if they are so deep in each other.
+      touching: two segments are joined if they border on each other and one is doubtful, or if their objects are so
+        deep in each other.
       part: least number of pixels of a part.
       jump: neighbouring pixels whose points are farther apart are not connected.
     """
@@ -132,17 +133,19 @@ def as_segmented(
 ) -> Fitted:
     """The `Fitter` that keeps the segments as they are, such as true masks."""
     # Compiled separately, since it does not depend on where the labels come from.
-    objects, pose = recognise_image(keys, image, shapes, camera, shelf, target, refinement)
-    measures = _measures_of_segments(keys[0], image, objects, camera)
+    objects, pose, error = recognise_image(keys, image, shapes, camera, shelf, target, refinement)
+    measures = _measures_of_segments(keys[0], image, objects, error, camera)
     return Fitted(objects, pose, confidence_of(measures), measures, image.labels, jnp.zeros(SLOTS, bool))
 
 
 @kept()
-def _measures_of_segments(key: Array, image: LabelledImage, objects: Superquadrics, camera: Camera) -> Measures:
+def _measures_of_segments(
+    key: Array, image: LabelledImage, objects: Superquadrics, error: Float[Array, " 8"], camera: Camera
+) -> Measures:
     costs = Costs()
     sample = sample_of(key, image, objects, camera, costs)
     unlimited = jnp.full(SLOTS, jnp.inf)
-    return measures_of(objects, image.labels, image, sample, unlimited, costs)
+    return measures_of(objects, image.labels, image, sample, error, unlimited, costs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,16 +196,31 @@ def explained_image(
         rotation=yaw_rotation(pose[2])[None],
         valid=has_pixels[None],
     )
-    return _explain(keys[0], image, body, pose, on_it, shapes, camera, shelf, refinement, config, least)
+    found = _Found(body, pose, on_it)
+    return _explain(keys[0], image, found, (shapes, camera, shelf, refinement), config, least)
 
 
-def _explain(key, image, body, pose, on_it, shapes, camera, shelf, refinement, config, least) -> Fitted:
-    """`explained_image` for a fitted target: its body, one slot, absent if it is not visible, and the pixels on it."""
-    keys = jax.random.split(key, 3)
-    settings = (shapes, camera, shelf, refinement)
+class _Found(flax.struct.PyTreeNode):
+    """The target: one slot, absent if it is not visible; its pose, and the pixels on it."""
+
+    body: Superquadrics
+    pose: jax.Array
+    on_it: jax.Array
+
+
+def _explain(
+    key: Array,
+    image: LabelledImage,
+    found: _Found,
+    settings: tuple[ShapeNetwork, Camera, Shelf, RefinementConfig],
+    config: ExplanationConfig,
+    least: Float[Array, ""] | float,
+) -> Fitted:
+    """`explained_image` for a fitted target."""
+    keys, body, camera = jax.random.split(key, 3), found.body, settings[1]
     slots = jnp.arange(SLOTS, dtype=image.labels.dtype)
     segments = image.labels[None] == slots[:, None, None]
-    base = fitted(keys[0], image, segments, jnp.any(segments, axis=(1, 2)), *settings)
+    base, base_error = fitted(keys[0], image, segments, jnp.any(segments, axis=(1, 2)), *settings)
     small = pixels_of(image.labels) <= jnp.sum(image.of_target)
     base = base.replace(valid=base.valid & ~(_inside(base, body) & small))
     # Pixels of segments without an object belong to none.
@@ -220,26 +238,31 @@ def _explain(key, image, body, pose, on_it, shapes, camera, shelf, refinement, c
     whole = (image.labels[None] == chosen[:, None, None])[:, None]
     halves = jnp.stack([first, whole & ~first], axis=2).reshape(-1, *image.labels.shape)
     counts = jnp.sum(halves, axis=(1, 2))
-    divided = jnp.repeat(doubtful[chosen], WAYS) & (jnp.min(counts.reshape(-1, 2), axis=1) >= config.part)
-    borders, pair = jax.lax.top_k(bordering(image, config.jump).reshape(-1), config.merges)
+    divided = (doubtful[chosen][:, None] & distinct(first, pixels[chosen])).reshape(-1)
+    divided &= jnp.min(counts.reshape(-1, 2), axis=1) >= config.part
+    # What something hides in the middle shows two segments that do not border on each other, but whose objects overlap.
+    borders, deep = bordering(image, config.jump), jnp.triu(penetrations(base) - config.touching, 1)
+    either = (borders >= 3) & (doubtful[:, None] | doubtful[None])
+    likely = jnp.where(either, borders, 0.0) + 1e4 * jnp.maximum(deep, 0.0)
+    likely, pair = jax.lax.top_k(likely.reshape(-1), config.merges)
     low, high = pair // SLOTS, pair % SLOTS
-    suspicious = doubtful[low] | doubtful[high] | (penetrations(base)[low, high] > config.touching)
-    joined = (borders >= 3) & base.valid[low] & base.valid[high] & suspicious
+    joined = (likely > 0.0) & base.valid[low] & base.valid[high]
     union = (image.labels[None] == low[:, None, None]) | (image.labels[None] == high[:, None, None])
-    of_target = 2 * jnp.sum(halves & on_it[None], axis=(1, 2)) > counts
+    of_target = 2 * jnp.sum(halves & found.on_it[None], axis=(1, 2)) > counts
     of_target &= counts <= jnp.sum(image.of_target)
     active = jnp.concatenate([jnp.repeat(divided, 2) & (counts > least) & ~of_target, joined])
-    fits = fitted(keys[2], image, jnp.concatenate([halves, union]), active, *settings)
+    fits, error = fitted(keys[2], image, jnp.concatenate([halves, union]), active, *settings)
     fits = fits.replace(valid=fits.valid & ~_inside(fits, body))
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), base, fits, body)
 
     selection = select_objects(everything, moves_of(chosen, divided, (low, high), joined), sample, pixels, config)
-    return _chosen(everything, selection, image, pose, on_it, sample, config)
+    errors = jnp.concatenate([base_error, error, jnp.zeros(1)])
+    return _chosen(everything, errors, selection, image, found, sample, config)
 
 
 def _without(labels: Int[Array, "h w"], absent: Bool[Array, " 8"]) -> Int[Array, "h w"]:
     """Labels in which the pixels of absent objects are OTHER."""
-    is_absent = (labels >= 0) & ((labels >= SLOTS) | absent[jnp.clip(labels, 0, SLOTS - 1)])
+    is_absent = (labels >= 0) & absent[jnp.clip(labels, 0, SLOTS - 1)]
     return jnp.where(is_absent, OTHER, labels).astype(labels.dtype)
 
 
@@ -256,10 +279,10 @@ def _inside(scene: Superquadrics, body: Superquadrics) -> Bool[Array, " n"]:
 
 def _chosen(
     everything: Superquadrics,
+    errors: Float[Array, " c"],
     selection: Selection,
     image: LabelledImage,
-    pose: Float[Array, " 3"],
-    on_it: Bool[Array, "h w"],
+    found: _Found,
     sample: Sample,
     config: ExplanationConfig,
 ) -> Fitted:
@@ -279,7 +302,7 @@ def _chosen(
     flat = jnp.where((labels == MISSING).reshape(-1, 1), 0.0, image.points.reshape(-1, 3))
     near = jnp.where(scene.valid[:, None], jnp.abs(surface_distance(scene, flat)), jnp.inf)
     nearest = jnp.where(jnp.min(near, axis=0) < sample.exact + config.wrong, jnp.argmin(near, axis=0), OTHER)
-    nearest = jnp.where(on_it, OTHER, nearest.reshape(labels.shape))
+    nearest = jnp.where(found.on_it, OTHER, nearest.reshape(labels.shape))
     labels = jnp.where(gone, nearest, labels).astype(labels.dtype)
-    measures = measures_of(scene, labels, image, sample, selection.margin[source], config)
-    return Fitted(standard_edges(scene), pose, confidence_of(measures), measures, labels, filled)
+    measures = measures_of(scene, labels, image, sample, errors[source], selection.margin[source], config)
+    return Fitted(standard_edges(scene), found.pose, confidence_of(measures), measures, labels, filled)

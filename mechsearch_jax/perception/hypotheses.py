@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.labels import MISSING
-from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_with_error
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.solids import surface_distance
 from mechsearch_jax.workspace.camera import Camera
@@ -19,6 +19,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 SLOTS = 8
 # Ways in which a segment is divided: see `parts`.
 WAYS = 3
+# Ways whose parts differ in less than this share of the segment's pixels are one.
+_ALIKE = 0.05
 # Rounds of spreading the numbers of connected pixels; each doubles how far they reach.
 _SPREADS = 12
 
@@ -94,6 +96,21 @@ def parts(
     return jax.lax.map(divide, chosen)
 
 
+def distinct(first: Bool[Array, "k ways h w"], pixels: Int[Array, " k"]) -> Bool[Array, "k ways"]:
+    """Which ways of division differ from all the ways before them.
+
+    Args:
+      first: as of `parts`.
+      pixels: number of pixels of each segment.
+    """
+    flat = first.reshape(*first.shape[:2], -1)
+    differ = jnp.sum(flat[:, :, None] != flat[:, None], axis=-1)
+    # Which of the parts is the first does not matter.
+    differ = jnp.minimum(differ, pixels[:, None, None] - differ)
+    alike = differ < _ALIKE * pixels[:, None, None]
+    return ~jnp.any(jnp.tril(alike, -1), axis=-1)
+
+
 def bordering(image: LabelledImage, jump: float) -> Float[Array, "8 8"]:
     """Number of neighbouring pixels of every two segments whose points are near; each pair once, above the diagonal."""
     total = jnp.zeros((SLOTS, SLOTS))
@@ -119,8 +136,11 @@ def fitted(
     camera: Camera,
     shelf: Shelf,
     refinement: RefinementConfig,
-) -> Superquadrics:
-    """The object of every mask that is active: the network's, refined; fields (C, ...). The others are not valid."""
+) -> tuple[Superquadrics, Float[Array, " c"]]:
+    """The object of every mask that is active: the network's, refined; and the network's expected error [m].
+
+    The objects of other masks are not valid.
+    """
     network = shapes.network
 
     def fit(shared, element, row):
@@ -128,15 +148,16 @@ def fitted(
         points, depth, labels = element
         mask, seed = row
         alone = jnp.where(mask, 0, jnp.where(labels >= 0, labels + 1, labels)).astype(jnp.int8)
-        scene = recognise(jax.random.key(seed), network, parameters, camera, points, alone, shelf, 1)
+        key = jax.random.key(seed)
+        scene, error = recognise_with_error(key, network, parameters, camera, points, alone, shelf, 1)
         refined = refine(camera, shelf, scene, points.reshape(-1, 3), alone.reshape(-1), depth, refinement).scene
-        return jax.tree.map(lambda a: a[0], refined)
+        return jax.tree.map(lambda a: a[0], (refined, error))
 
     seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
     shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
     # On a CPU, the network and the refinement are the faster the fewer segments they get at once.
-    fits = masked_vmap(fit, active, shared, element, (masks, seeds), block=1)
-    return fits.replace(valid=fits.valid & active, size=jnp.where(active[:, None], fits.size, 0.01))
+    fits, error = masked_vmap(fit, active, shared, element, (masks, seeds), block=1)
+    return fits.replace(valid=fits.valid & active, size=jnp.where(active[:, None], fits.size, 0.01)), error
 
 
 def pixels_of(labels: Int[Array, "h w"]) -> Int[Array, " 8"]:

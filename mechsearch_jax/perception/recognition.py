@@ -8,7 +8,7 @@ from typing import Any, cast
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
@@ -40,6 +40,15 @@ def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics
         rotation=matmul(R_world_segment, chosen(hypotheses.rotation)),
         valid=segments.valid,
     )
+
+
+def expected_error(hypotheses: Hypotheses) -> Float[Array, " s"]:
+    """How far the network expects the centre of the likeliest hypothesis to be from the true one, per segment [m]."""
+    share = jax.nn.softmax(hypotheses.logit, axis=-1)
+    best = jnp.argmax(hypotheses.logit, axis=-1)[:, None, None]
+    chosen = jnp.take_along_axis(hypotheses.position, best, axis=1)
+    square = jnp.sum((hypotheses.position - chosen) ** 2 + jnp.exp(2.0 * hypotheses.log_scale[..., 3:]), axis=-1)
+    return jnp.sum(share * jnp.sqrt(square), axis=-1)
 
 
 def nearness(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
@@ -82,10 +91,26 @@ def recognise(
       count: number of slots; static.
       config: how segments' clouds are drawn; static.
     """
+    return recognise_with_error(key, network, parameters, camera, points, labels, shelf, count, config)[0]
+
+
+@functools.partial(jax.jit, static_argnames=("network", "count", "config"))
+def recognise_with_error(
+    key: Key[Array, ""],
+    network: RecognitionNetwork,
+    parameters: Any,
+    camera: Camera,
+    points: Float[Array, "h w 3"],
+    labels: Int[Array, "h w"],
+    shelf: Shelf | None = None,
+    count: int = 8,
+    config: SegmentConfig | None = None,
+) -> tuple[Superquadrics, Float[Array, " s"]]:
+    """`recognise`, and the network's `expected_error` of each [m]."""
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)
     eyes = nearness(camera, shelf or Shelf()) * segments.camera
     hypotheses = apply_network(network, parameters, segments.points, segments.mark, eyes)
-    return best_hypothesis(hypotheses, segments)
+    return best_hypothesis(hypotheses, segments), expected_error(hypotheses)
 
 
 class ShapeNetwork(flax.struct.PyTreeNode):
@@ -134,7 +159,7 @@ def recognise_image(
     shelf: Shelf,
     target: Target,
     refinement: RefinementConfig,
-) -> tuple[Superquadrics, Float[Array, " 3"]]:
+) -> tuple[Superquadrics, Float[Array, " 3"], Float[Array, " 8"]]:
     """The objects of a labelled image, and the target's pose: network, refinement, `superquadric.standard_edges`.
 
     A segment that lies mostly in or on the target is ignored.
@@ -148,28 +173,14 @@ def recognise_image(
       target, refinement: static.
 
     Returns:
-      Eight slots, of which slot i is instance i; and x, y [m] and yaw [rad] of the target, meaningless but finite if it
-      has no pixels.
+      Eight slots, of which slot i is instance i; x, y [m] and yaw [rad] of the target, meaningless but finite if it has
+      no pixels; and the network's `expected_error` of each object [m].
     """
-    scene, _, pose, _ = fitted_segments(keys, image, shapes, camera, shelf, target, refinement)
-    return standard_edges(scene), pose
-
-
-def fitted_segments(
-    keys: Key[Array, "2"],
-    image: LabelledImage,
-    shapes: ShapeNetwork,
-    camera: Camera,
-    shelf: Shelf,
-    target: Target,
-    refinement: RefinementConfig,
-) -> tuple[Superquadrics, Int[Array, "h w"], Float[Array, " 3"], Bool[Array, ""]]:
-    """The refined objects of an image's segments, the labels without segments on the target, its pose, and whether it
-    has pixels; arguments as of `recognise_image`."""
     object_key, target_key = keys
     pose, has_pixels = fitted_pose(target_key, target, shelf, camera, image.points, image.of_target)
     on_it = near_target(target, shelf, pose, image.points) & has_pixels
     labels = without_phantoms(image.labels, on_it, image.of_target)
-    scene = recognise(object_key, shapes.network, shapes.parameters, camera, image.points, labels, shelf)
+    network, parameters = shapes.network, shapes.parameters
+    scene, error = recognise_with_error(object_key, network, parameters, camera, image.points, labels, shelf)
     refined = refine(camera, shelf, scene, image.points.reshape(-1, 3), labels.reshape(-1), image.depth, refinement)
-    return refined.scene, labels, pose, has_pixels
+    return standard_edges(refined.scene), pose, error

@@ -57,7 +57,7 @@ def program(name: str, function: Any, *args: Any) -> Program:
 
 def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> list[Program]:
     """The programs of the first decision and action that take long to compile, the longest first."""
-    shapes = jax.eval_shape(lambda: Observation(empty(SLOTS), jax.numpy.array(False), jax.numpy.zeros(3)))
+    shapes = jax.eval_shape(lambda: Observation(empty(SLOTS), jax.numpy.array(False), jax.numpy.zeros(3)).judged())
     seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
     belief = initial_belief(problem)
     programs = []

@@ -290,7 +290,7 @@ class Searcher:
             check_joints("joints", joints)
         width = None if width is None else checked_width(width, problem.gripper.max_opening)
         misplaced = self._placement_faults(depth)
-        observation = self.recogniser(recognition_key, depth, colour, mask, target_id)
+        observation = self.recogniser(recognition_key, depth, colour, mask, target_id).judged()
         warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
         unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
         warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]

@@ -98,7 +98,7 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
 
 def beginning(problem: Problem) -> State:
     """The state before the first images."""
-    nothing = Observation(empty(MAX_OBJECTS), jnp.array(False), jnp.zeros(3))
+    nothing = Observation(empty(MAX_OBJECTS), jnp.array(False), jnp.zeros(3)).judged()
     return State(0, initial_belief(problem), nothing, no_action(), handed=False, acted=False, finished=False)
 
 

@@ -61,7 +61,7 @@ def _is_finite(scene: Superquadrics) -> np.ndarray:
 
 def _objects(step: SearchStep) -> list[dict[str, Any]]:
     """The recognised objects; `slot` is what an action's `object` refers to."""
-    scene = step.observation.objects
+    scene, confidence = step.observation.objects, np.asarray(step.observation.judged().confidence)
     return [
         {
             "slot": i,
@@ -70,6 +70,7 @@ def _objects(step: SearchStep) -> list[dict[str, Any]]:
             "position": _list(scene.position[i]),
             "rotation": _list(scene.rotation[i]),
             "quaternion": np.roll(Rotation.from_matrix(np.asarray(scene.rotation[i], float)).as_quat(), 1).tolist(),
+            "confidence": round(float(confidence[i]), 3),
         }
         for i in np.flatnonzero(np.asarray(scene.valid) & _is_finite(scene)).tolist()
     ]

@@ -13,6 +13,7 @@ from mechsearch_jax.commands.options import (
 )
 
 Noise = Literal["clean", "gaussian", "time-of-flight"]
+Segments = Literal["network", "explained", "true"]
 
 
 def bench_looks(
@@ -20,18 +21,20 @@ def bench_looks(
     /,
     *,
     noise: tuple[Noise, ...] = ("gaussian",),
-    segments: Literal["network", "explained", "true"] = "explained",
+    segments: tuple[Segments, ...] = ("explained",),
     seed: int = 0,
     out: JsonFile = None,
 ) -> None:
-    """Measure what comes of a depth image alone: which visible objects are missing, off or turned, and phantoms.
+    """Measure what comes of a depth image alone: which visible objects are missing, off or turned, phantoms, and how
+    often objects are wrong by their stated confidence.
 
     MuJoCo renders the images, not the package's own camera.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       noise: of the depth image, one or more; "gaussian" is 1 mm.
-      segments: those that explain the image, the segmentation network's alone, or the true masks.
+      segments: those that explain the image, the segmentation network's alone, or the true masks; several are looked at
+        in turn.
       seed: of the noise and of the recogniser.
       out: JSON file for the figures, and for every object that is not right.
     """
@@ -52,11 +55,10 @@ def bench_looks(
             scenario = load_scenario(file)
             pictures[scenario.name] = scenario, looks.taken(Workcell(), scenario)
             status.update(f"rendering {number + 1}/{len(files)}")
-        bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), segments, seed)
+        bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
         forget_kept_compilations()
-        total = len(bench.pictures) * len(bench.noises)
         status.update("compiling")
-        measured = bench.run(lambda done: status.update(f"looking {done}/{total}"))
+        measured = bench.run(lambda done: status.update(f"looking {done}/{bench.looks}"))
         if out is not None:
             save_json(measured.value(), out)
     console.print(looks_tables(measured))
