@@ -76,7 +76,7 @@ def measures_of(
     )
 
 
-def confidence_of(measures: Measures) -> Float[Array, " 8"]:
+def confidence_of(measures: Measures) -> Float[Array, " n"]:
     """The probability that each object is right to 2 cm and 15 degrees; 0 for absent ones."""
     error = jnp.log(jnp.clip(measures.error, *ERRORS))
     misfit = jnp.log(measures.misfit + LEAST_MISFIT)
