@@ -307,6 +307,7 @@ def test_a_step_is_written_as_json(problem):
     assert box["size"] == pytest.approx(OPEN.objects[0].half_size, abs=1e-5)
     assert (np.shape(box["rotation"]), box["slot"], len(box["exponents"])) == ((3, 3), 0, 2)
     assert box["quaternion"] == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-5)
+    assert 0.0 < box["confidence"] <= 1.0
     target = values["target"]
     assert target["visible"]
     assert target["found_pose"][:2] == pytest.approx(OPEN.target.position[:2], abs=1e-5)
