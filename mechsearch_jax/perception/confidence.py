@@ -3,7 +3,7 @@
 Three things are measured for each object: how far the recognition network expects the centre to be from the true one,
 which share of its pixels does not lie on it or has rays that pass through it, and by how much it is better than what
 would stand for its pixels otherwise. A logistic function of their logarithms, fitted on development scenes, gives the
-probability that the object is right to 2 cm and 15 degrees (docs/experiments.md, "How sure a shape is").
+probability that the object is right to 2 cm and 15 degrees (docs/experiments.md, "Explaining the image").
 """
 
 from __future__ import annotations
