@@ -112,7 +112,7 @@ def selection(bodies, shown, unions=(), target=None, costs=None):
     image = LabelledImage(points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.zeros(depth.shape, bool))
     costs = costs or Costs()
     base = jax.tree.map(lambda a: a[:SLOTS], scene)
-    sample = sample_of(jax.random.key(0), image, base, camera, costs)
+    sample = sample_of(jax.random.key(0), image, base, camera, SHELF, costs)
     pair = jnp.zeros(len(unions), int), jnp.ones(len(unions), int)
     moves = moves_of(jnp.zeros(1, int), jnp.zeros(WAYS, bool), pair, jnp.ones(len(unions), bool))
     pixels = jnp.zeros(SLOTS, int).at[0].set(int(shows.sum()))

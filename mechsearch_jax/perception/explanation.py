@@ -134,16 +134,16 @@ def as_segmented(
     """The `Fitter` that keeps the segments as they are, such as true masks."""
     # Compiled separately, since it does not depend on where the labels come from.
     objects, pose, error = recognise_image(keys, image, shapes, camera, shelf, target, refinement)
-    measures = _measures_of_segments(keys[0], image, objects, error, camera)
+    measures = _measures_of_segments(keys[0], image, objects, error, camera, shelf)
     return Fitted(objects, pose, confidence_of(measures), measures, image.labels, jnp.zeros(SLOTS, bool))
 
 
 @kept()
 def _measures_of_segments(
-    key: Array, image: LabelledImage, objects: Superquadrics, error: Float[Array, " 8"], camera: Camera
+    key: Array, image: LabelledImage, objects: Superquadrics, error: Float[Array, " 8"], camera: Camera, shelf: Shelf
 ) -> Measures:
     costs = Costs()
-    sample = sample_of(key, image, objects, camera, costs)
+    sample = sample_of(key, image, objects, camera, shelf, costs)
     unlimited = jnp.full(SLOTS, jnp.inf)
     return measures_of(objects, image.labels, image, sample, error, unlimited, costs)
 
@@ -217,7 +217,7 @@ def _explain(
     least: Float[Array, ""] | float,
 ) -> Fitted:
     """`explained_image` for a fitted target."""
-    keys, body, camera = jax.random.split(key, 3), found.body, settings[1]
+    keys, body = jax.random.split(key, 3), found.body
     slots = jnp.arange(SLOTS, dtype=image.labels.dtype)
     segments = image.labels[None] == slots[:, None, None]
     base, base_error = fitted(keys[0], image, segments, jnp.any(segments, axis=(1, 2)), *settings)
@@ -225,7 +225,7 @@ def _explain(
     base = base.replace(valid=base.valid & ~(_inside(base, body) & small))
     # Pixels of segments without an object belong to none.
     image = image.replace(labels=_without(image.labels, ~base.valid))
-    sample = sample_of(keys[1], image, base, camera, config)
+    sample = sample_of(keys[1], image, base, *settings[1:3], config)
     pixels = pixels_of(image.labels)
     of_own = sample.label[None] == jnp.arange(SLOTS)[:, None]
     badly = jnp.sum(point_cost(surface_distance(base, sample.points), sample, config) * of_own, axis=1) * sample.weight
@@ -237,7 +237,7 @@ def _explain(
     first = parts(image, base, chosen, sample.exact + config.wrong / 2, config.jump)
     whole = (image.labels[None] == chosen[:, None, None])[:, None]
     halves = jnp.stack([first, whole & ~first], axis=2).reshape(-1, *image.labels.shape)
-    counts = jnp.sum(halves, axis=(1, 2))
+    counts = jnp.sum(halves & sample.judged[None], axis=(1, 2))
     divided = (doubtful[chosen][:, None] & distinct(first, pixels[chosen])).reshape(-1)
     divided &= jnp.min(counts.reshape(-1, 2), axis=1) >= config.part
     # What something hides in the middle shows two segments that do not border on each other, but whose objects overlap.
@@ -248,7 +248,7 @@ def _explain(
     low, high = pair // SLOTS, pair % SLOTS
     joined = (likely > 0.0) & base.valid[low] & base.valid[high]
     union = (image.labels[None] == low[:, None, None]) | (image.labels[None] == high[:, None, None])
-    of_target = 2 * jnp.sum(halves & found.on_it[None], axis=(1, 2)) > counts
+    of_target = 2 * jnp.sum(halves & found.on_it[None], axis=(1, 2)) > jnp.sum(halves, axis=(1, 2))
     of_target &= counts <= jnp.sum(image.of_target)
     active = jnp.concatenate([jnp.repeat(divided, 2) & (counts > least) & ~of_target, joined])
     fits, error = fitted(keys[2], image, jnp.concatenate([halves, union]), active, *settings)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.images.cloud import draw
+from mechsearch_jax.images.cloud import above_board, draw
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.hypotheses import SLOTS, WAYS
 from mechsearch_jax.perception.recognition import LabelledImage
@@ -20,6 +20,7 @@ from mechsearch_jax.perception.refinement import FAR
 from mechsearch_jax.perception.solids import entries, penetrations, surface_distance
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
+from mechsearch_jax.workspace.shelf import Shelf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Costs:
       exact: a point this near to an object's surface is explained, or one that is so many times as near as ...
       deviations: ... the median of the points of the segments.
       wrong: a point that is farther by this is not; between the two its cost grows evenly.
+      faces: points within this distance of the shelf's faces are not judged: with a camera that is a little off they may
+        be the shelf's.
       shrink: rays may pass this deep below an object's faces.
       object: price of an object.
       gain: by how much another explanation must be better, and ...
@@ -45,6 +48,7 @@ class Costs:
     exact: float = 0.003
     deviations: float = 2.5
     wrong: float = 0.005
+    faces: float = 0.008
     shrink: float = 0.005
     object: float = 8.0
     gain: float = 4.0
@@ -79,6 +83,7 @@ class Sample(flax.struct.PyTreeNode):
       directions: of rays, shape (R, 3).
       free: length up to which each ray is free; 0 if nothing was measured.
       exact: a point this near to a surface is explained [m].
+      judged: the pixels that an explanation is judged by, shape (h, w).
       ray_weight: pixels for each ray; static.
     """
 
@@ -89,12 +94,16 @@ class Sample(flax.struct.PyTreeNode):
     directions: jax.Array
     free: jax.Array
     exact: jax.Array
+    judged: jax.Array
     ray_weight: float = flax.struct.field(pytree_node=False)
 
 
-def sample_of(key: Array, image: LabelledImage, base: Superquadrics, camera: Camera, costs: Costs) -> Sample:
+def sample_of(
+    key: Array, image: LabelledImage, base: Superquadrics, camera: Camera, shelf: Shelf, costs: Costs
+) -> Sample:
     """Points and rays of an image; `base` are the objects of its segments."""
-    things = (image.labels != FREE) & (image.labels != MISSING) & ~image.of_target
+    judged = above_board(shelf, image.points, costs.faces) & ~image.of_target
+    things = (image.labels != FREE) & (image.labels != MISSING) & judged
     index, total = draw(key, things.reshape(-1), costs.points)
     height, width = image.labels.shape
     step = max(1, math.ceil(math.sqrt(height * width / costs.rays)))
@@ -114,6 +123,7 @@ def sample_of(key: Array, image: LabelledImage, base: Superquadrics, camera: Cam
         directions=pixel_rays(camera, *grid).reshape(-1, 3),
         free=free,
         exact=jnp.maximum(costs.exact, costs.deviations * jnp.nan_to_num(usual)),
+        judged=judged,
         ray_weight=float(step**2),
     )
 
