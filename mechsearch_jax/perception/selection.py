@@ -33,8 +33,8 @@ class Costs:
       exact: a point this near to an object's surface is explained, or one that is so many times as near as ...
       deviations: ... the median of the points of the segments.
       wrong: a point that is farther by this is not; between the two its cost grows evenly.
-      faces: points within this distance of the shelf's faces are not judged: with a camera that is a little off they may
-        be the shelf's.
+      faces: points within this distance of the shelf's faces are not judged: with a camera that is a little off they
+        may be the shelf's.
       shrink: rays may pass this deep below an object's faces.
       object: price of an object.
       gain: by how much another explanation must be better, and ...
