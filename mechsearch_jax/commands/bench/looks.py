@@ -41,7 +41,7 @@ def bench_looks(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.looks import looks
-    from mechsearch_jax.benchmarks.report.console_tables import looks_tables
+    from mechsearch_jax.benchmarks.report.looks_tables import looks_tables
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.runtime.files import save_json
     from mechsearch_jax.workspace.scenario import load_scenario
