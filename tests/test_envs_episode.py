@@ -32,6 +32,7 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodi
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.numbering import named_observation
 from mechsearch_jax.envs.episode.protocols import WithTruePose
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
 from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
@@ -39,7 +40,7 @@ from mechsearch_jax.envs.recording.pictures import frame
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.runtime.errors import InputError
@@ -146,6 +147,17 @@ def test_objects_are_named_after_the_nearest_bodies(problem):
     np.testing.assert_array_equal(bodies[[0, 2]], [0, 2])
     assert bodies[1] >= 3
     np.testing.assert_array_equal(there[:3], [True, False, True])
+
+
+def test_how_sure_an_object_is_keeps_to_the_object():
+    bodies = np.array([2, 0, 1])
+    place = np.arange(9.0).reshape(3, 3)
+    objects = Superquadrics(np.ones((3, 3)), np.ones((3, 2)), place, np.ones((3, 3, 3)), np.ones(3, bool))
+    seen = Observation(objects, np.array(False), np.zeros(3), np.array([0.9, 0.5, 0.7]))
+    named = named_observation(seen, bodies)
+    np.testing.assert_array_equal(named.confidence, [0.5, 0.7, 0.9])
+    np.testing.assert_array_equal(named.objects.position, place[[1, 2, 0]])
+    assert named_observation(seen.replace(confidence=None), bodies).confidence is None
 
 
 def test_the_sum_of_distances_decides_which_body_an_object_stands_for(problem):

@@ -259,3 +259,24 @@ def test_without_masks_most_visible_objects_are_separated(world):
     truth = jax.tree.map(lambda a: a[bodies], sharpened(true_superquadrics(world)))
     overlap = np.asarray(intersection_over_union(truth, recognised.objects))[np.asarray(there)]
     assert (overlap > 0.5).sum() >= 3
+
+
+@pytest.mark.slow
+def test_a_target_that_is_not_detected_is_given_to_no_object(world):
+    full = recogniser("full", target_of(SCENE))
+    fits = []
+
+    def fitter(*arguments, **options):
+        fits.append(full.fitter(*arguments, **options))
+        return fits[-1]
+
+    x, _, z = SCENE.target.position
+    view = thinned_view(CAMERA, SHELF)
+    peeping = moved(world, TARGET, [x, -0.034, z])
+    seen = dataclasses.replace(full, fitter=fitter)(jax.random.key(0), Snapshot(CAMERA, SHELF, peeping))
+    owner = np.asarray(observe(view.camera, peeping, SHELF).segmentation)
+    labels = np.asarray(fits[0].labels)[owner == TARGET]
+    assert not seen.target_visible
+    assert 5 < len(labels) <= found_pixels(CAMERA) / view.stride**2
+    assert (labels < 0).all()
+    np.testing.assert_array_equal(seen.confidence > 0.0, seen.objects.valid)

@@ -33,7 +33,13 @@ def named_objects(objects: Superquadrics, bodies: Bodies, axis: int = 0) -> Supe
 
 def named_observation(observation: Observation, bodies: Bodies) -> Observation:
     """An observation with its objects in the slots of the bodies that they stand for."""
-    return observation.replace(objects=named_objects(observation.objects, bodies))
+    if _are_same(bodies):
+        return observation
+    confidence = observation.confidence
+    return observation.replace(
+        objects=named_objects(observation.objects, bodies),
+        confidence=None if confidence is None else np.asarray(confidence)[np.argsort(bodies)],
+    )
 
 
 def named_decision(decision: Decision, bodies: Bodies) -> Decision:
