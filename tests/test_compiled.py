@@ -375,4 +375,4 @@ def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
 @pytest.mark.slow
 def test_recognition_which_uses_lapack_runs_from_disk(tmp_path):
     assert run(PERCEIVE, tmp_path) == run(PERCEIVE, tmp_path)
-    assert {file.name.partition("-")[0] for file in (tmp_path / "executables").iterdir()} >= {"recognise_image"}
+    assert {file.name.partition("-")[0] for file in (tmp_path / "executables").iterdir()} >= {"explained_image"}

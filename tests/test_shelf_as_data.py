@@ -22,8 +22,8 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.images.cloud import thinned_view
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception import explanation, recognition
 from mechsearch_jax.perception import recogniser as recognising
-from mechsearch_jax.perception import recognition
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
@@ -226,7 +226,7 @@ def test_a_sight_that_was_given_is_what_is_found_without(two):
 
 def test_images_are_recognised_by_one_program_for_both(two):
     images = example_images()
-    parts = recognising._labelled, recognition.recognise_image
+    parts = recognising._labelled, explanation.explained_image
     first, second = map(Recogniser, two)
     seen = first(KEY, images.depth, images.colour)
     sizes = [cache_size(part) for part in parts]

@@ -40,7 +40,7 @@ from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.noise import TimeOfFlight, depth_of
 from mechsearch_jax.perception.doubt import Thing
-from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
+from mechsearch_jax.perception.explanation import Explaining, ExplanationConfig, Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.scores import EDGE, intersection_over_union, sharpened
 from mechsearch_jax.problem.workcell import Workcell
@@ -49,9 +49,14 @@ from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import Body, Scenario, superquadrics
 
 NoiseName = Literal["clean", "gaussian", "time-of-flight"]
-Segments = Literal["network", "explained", "true"]
+Segments = Literal["network", "explained", "joined", "true"]
 # What fits objects, by the segments.
-FITTERS: Mapping[Segments, Fitter] = {"network": as_segmented, "explained": Explaining(), "true": as_segmented}
+FITTERS: Mapping[Segments, Fitter] = {
+    "network": as_segmented,
+    "explained": Explaining(),
+    "joined": Explaining(ExplanationConfig(splits=0)),
+    "true": as_segmented,
+}
 # Ranges of pixels by which objects are counted: name, from, to below.
 SIZES = (("100 to 1000", 100, 1000), ("1000 to 5000", 1000, 5000), ("5000 and more", 5000, np.inf))
 
@@ -215,7 +220,7 @@ class Bench:
       pictures: images of scenes by name, each with its scenario.
       noises: of `NoiseName`.
       segments: one or more of `Segments`: "explained" or "network" for depth images alone, with and without
-        `perception.explanation`; "true" for the true masks beside them.
+        `perception.explanation`, "joined" where it divides no segment; "true" for the true masks beside them.
       seed: of the noise and of the recogniser.
       workcell: camera and shelf; its target is what the recogniser knows.
     """

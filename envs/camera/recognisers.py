@@ -39,12 +39,9 @@ from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.detector import found_pixels
+from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
-
-# A thinned image may overestimate an object's number of pixels by this factor.
-SAMPLED = 1.5
 
 RecognitionName = Literal["oracle", "masks", "full", "informed"]
 # The recognisers that see no image.
@@ -84,23 +81,19 @@ class ImageRecogniser:
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
-      fitter: fits objects to the labelled image.
     """
 
     target: Target
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
-    fitter: Fitter = as_segmented
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
-        unseen = found_pixels(snapshot.camera) / view.stride**2
         image = labelled(keys[0], self, view, shelf, snapshot.world, snapshot.target_seen, snapshot.sensing)
         shapes = ShapeNetwork.of(self.weights)
-        settings = (shapes, view.camera, shelf, self.target, self.refinement)
-        fitted = self.fitter(keys[2:], image, *settings, least=SAMPLED * unseen)
+        fitted = as_segmented(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
         return Observation(fitted.objects, snapshot.target_seen, fitted.target_pose, fitted.confidence)
 
 

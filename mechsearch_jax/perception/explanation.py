@@ -30,7 +30,7 @@ from mechsearch_jax.perception.selection import (
     Costs,
     Sample,
     Selection,
-    check_positive,
+    check_numbers,
     moves_of,
     passed,
     point_cost,
@@ -50,8 +50,8 @@ class ExplanationConfig(Costs):
     """Which segments are tried otherwise, and what an explanation costs; lengths in metres, costs in view pixels.
 
     Attributes:
-      splits: number of the most doubtful segments that are divided.
-      merges: number of pairs of segments that are joined.
+      splits: number of the most doubtful segments that are divided; 0 for none.
+      merges: number of pairs of segments that are joined; 0 for none.
       doubtful: a segment is doubtful if so many of its pixels are badly explained, and ...
       doubtful_share: ... such a share of them.
       touching: two segments are joined if they border on each other and one is doubtful, or if their objects are so
@@ -69,9 +69,10 @@ class ExplanationConfig(Costs):
     jump: float = 0.012
 
     def __post_init__(self):
-        check_positive(self)
-        if self.splits > SLOTS:
-            raise InputError(f"ExplanationConfig: splits ({self.splits}) must be at most {SLOTS}")
+        check_numbers(self, positive=("points", "rays", "wrong"))
+        for name, most in (("splits", SLOTS), ("merges", SLOTS**2)):
+            if (number := getattr(self, name)) > most:
+                raise InputError(f"ExplanationConfig: {name} ({number}) must be at most {most}")
 
 
 class Fitted(flax.struct.PyTreeNode):
@@ -187,7 +188,9 @@ def explained_image(
     """The objects that explain an image; arguments as of `Fitter`, `config` is static."""
     pose, has_pixels = fitted_pose(keys[1], target, shelf, camera, image.points, image.of_target)
     on_it = near_target(target, shelf, pose, image.points) & has_pixels
-    image = image.replace(labels=without_phantoms(image.labels, on_it, image.of_target))
+    labels = without_phantoms(image.labels, on_it, image.of_target)
+    # An instance beyond the slots has no object.
+    image = image.replace(labels=jnp.where(labels < SLOTS, labels, OTHER).astype(labels.dtype))
     place = jnp.stack([pose[0], pose[1], jnp.float32(target.height(shelf))])
     body = Superquadrics(
         size=jnp.array([target.half_size], jnp.float32),

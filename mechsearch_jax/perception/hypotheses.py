@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.labels import MISSING
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_with_error
@@ -103,7 +103,7 @@ def distinct(first: Bool[Array, "k ways h w"], pixels: Int[Array, " k"]) -> Bool
       first: as of `parts`.
       pixels: number of pixels of each segment.
     """
-    flat = first.reshape(*first.shape[:2], -1)
+    flat = first.reshape(*first.shape[:2], first.shape[2] * first.shape[3])
     differ = jnp.sum(flat[:, :, None] != flat[:, None], axis=-1)
     # Which of the parts is the first does not matter.
     differ = jnp.minimum(differ, pixels[:, None, None] - differ)
@@ -155,8 +155,9 @@ def fitted(
 
     seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
     shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
-    # On a CPU, the network and the refinement are the faster the fewer segments they get at once.
-    fits, error = masked_vmap(fit, active, shared, element, (masks, seeds), block=1)
+    # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more.
+    block = 1 if on_cpu() else SLOTS
+    fits, error = masked_vmap(fit, active, shared, element, (masks, seeds), block=block)
     return fits.replace(valid=fits.valid & active, size=jnp.where(active[:, None], fits.size, 0.01)), error
 
 

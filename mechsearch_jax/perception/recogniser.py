@@ -31,7 +31,7 @@ from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
-from mechsearch_jax.workspace.detector import found_pixels
+from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
@@ -200,7 +200,8 @@ class Recogniser:
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
         fitter = self.fitter if mask is None else as_segmented
         settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
-        return fitter(keys[1:], image, *settings), visible
+        unseen = found_pixels(self.camera) / self.view.stride**2
+        return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible
 
 
 def _as_pytree(slot: Any) -> Any:

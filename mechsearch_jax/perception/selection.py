@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import above_board, draw
-from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.labels import OTHER
 from mechsearch_jax.perception.hypotheses import SLOTS, WAYS
 from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.refinement import FAR
@@ -57,26 +57,30 @@ class Costs:
     overlap_cost: float = 20.0
 
     def __post_init__(self):
-        check_positive(self)
+        check_numbers(self, positive=("points", "rays", "wrong"))
 
 
-def check_positive(config: Costs) -> None:
-    """Check that all numbers of a configuration are positive.
+def check_numbers(config: Costs, positive: tuple[str, ...]) -> None:
+    """Check that all numbers of a configuration are finite and at least 0, and some of them more.
+
+    Args:
+      config: what is checked.
+      positive: names of those that must be more than 0.
 
     Raises:
       InputError: one is not.
     """
     for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{type(config).__name__}: {field.name} ({value}) must be positive")
+        value, least = getattr(config, field.name), "positive" if field.name in positive else "at least 0"
+        if not (math.isfinite(value) and value >= 0 and (value > 0 or field.name not in positive)):
+            raise InputError(f"{type(config).__name__}: {field.name} ({value}) must be {least}")
 
 
 class Sample(flax.struct.PyTreeNode):
     """Points and rays that an explanation is judged by.
 
     Attributes:
-      points: of things on the board [m], shape (M, 3).
+      points: of segments [m], shape (M, 3).
       label: of each point.
       weight: pixels for each point.
       origin: of the rays, shape (3,).
@@ -103,8 +107,8 @@ def sample_of(
 ) -> Sample:
     """Points and rays of an image; `base` are the objects of its segments."""
     judged = above_board(shelf, image.points, costs.faces) & ~image.of_target
-    things = (image.labels != FREE) & (image.labels != MISSING) & judged
-    index, total = draw(key, things.reshape(-1), costs.points)
+    # What belongs to no segment speaks for no object.
+    index, total = draw(key, ((image.labels >= 0) & judged).reshape(-1), costs.points)
     height, width = image.labels.shape
     step = max(1, math.ceil(math.sqrt(height * width / costs.rays)))
     rows, columns = (jnp.arange(step // 2, size, step) for size in (height, width))

@@ -12,6 +12,8 @@ from mechsearch_jax.workspace.camera import Camera
 # The target is visible with more pixels than this in an image of this size, as in the paper.
 FOUND_PIXELS = 100
 IMAGE_SIZE = (1280, 720)
+# A thinned image may overestimate an object's number of pixels by this factor.
+SAMPLED = 1.5
 
 
 def found_pixels(camera: Camera, pixels: int | float = FOUND_PIXELS) -> float:

@@ -13,7 +13,7 @@ from mechsearch_jax.commands.options import (
 )
 
 Noise = Literal["clean", "gaussian", "time-of-flight"]
-Segments = Literal["network", "explained", "true"]
+Segments = Literal["network", "explained", "joined", "true"]
 
 
 def bench_looks(
@@ -33,8 +33,8 @@ def bench_looks(
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       noise: of the depth image, one or more; "gaussian" is 1 mm.
-      segments: those that explain the image, the segmentation network's alone, or the true masks; several are looked at
-        in turn.
+      segments: those that explain the image, the same without dividing one, the segmentation network's alone, or the
+        true masks; several are looked at in turn.
       seed: of the noise and of the recogniser.
       out: JSON file for the figures, and for every object that is not right.
     """
