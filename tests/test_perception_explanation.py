@@ -91,8 +91,9 @@ def test_right_segments_stay_and_two_in_one_are_split(explained):
 BOX = (0.03, 0.03, 0.05)
 
 
-def selection(bodies, shown, unions=(), target=None, costs=None):
-    """What is selected of bodies for the first segments and for the first unions, in an image of the bodies `shown`."""
+def selection(bodies, shown, unions=(), target=None, costs=None, segmented=None):
+    """What is selected of bodies for the first segments and for the first unions, in an image of the bodies `shown`, of
+    which the first `segmented`, all if None, have segments."""
     count = 2 * WAYS
     scene = superquadrics([*bodies], SLOTS + count + len(unions) + 1)
     absent = np.arange(scene.capacity) >= len(bodies)
@@ -103,12 +104,14 @@ def selection(bodies, shown, unions=(), target=None, costs=None):
     camera, directions = VIEW.camera, rays(VIEW.camera)
     truth = superquadrics(shown)
     origin = jnp.array(camera.position)
-    depth = np.min(
-        [object_depth(jax.tree.map(lambda a, i=i: a[i], truth), origin, directions) for i in range(len(shown))], 0
+    depths = np.stack(
+        [object_depth(jax.tree.map(lambda a, i=i: a[i], truth), origin, directions) for i in range(len(shown))]
     )
+    depth, owner = depths.min(axis=0), depths.argmin(axis=0)
     points = back_project(camera, jnp.asarray(np.where(np.isfinite(depth), depth, np.nan), jnp.float32))
     shows = np.isfinite(depth)
-    labels = np.where(shows, 0, FREE).astype(np.int8)
+    owner = np.where(owner < (len(shown) if segmented is None else segmented), owner, OTHER)
+    labels = np.where(shows, owner, FREE).astype(np.int8)
     image = LabelledImage(points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.zeros(depth.shape, bool))
     costs = costs or Costs()
     base = jax.tree.map(lambda a: a[:SLOTS], scene)
@@ -143,6 +146,13 @@ def test_two_objects_in_one_another_become_one():
     assert selection(parts, [whole], unions=[whole])[0] == [SLOTS + 2 * WAYS]
 
 
+def test_pixels_of_no_segment_speak_for_no_object():
+    """The second box would explain what is shown of it, but that belongs to no segment."""
+    bodies = [box(0.0, -0.1, BOX), box(0.0, 0.1, BOX)]
+    assert selection(bodies, bodies)[0] == [0, 1]
+    assert selection(bodies, bodies, segmented=1)[0] == [0]
+
+
 def test_ways_that_divide_a_segment_alike_are_one():
     first = np.zeros((1, WAYS, 10, 10), bool)
     first[0, 0, :5] = True
@@ -167,5 +177,8 @@ def test_confidence_falls_with_what_is_measured():
 def test_impossible_settings_are_refused():
     with pytest.raises(InputError, match="gain"):
         ExplanationConfig(gain=-1.0)
+    with pytest.raises(InputError, match=r"wrong \(0.0\) must be positive"):
+        ExplanationConfig(wrong=0.0)
     with pytest.raises(InputError, match="at most 8"):
         ExplanationConfig(splits=9)
+    assert ExplanationConfig(splits=0, gain=0.0).splits == 0
