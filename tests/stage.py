@@ -187,7 +187,8 @@ class Shuffled:
 
     def __call__(self, key, snapshot):
         seen = self.inner(key, snapshot)
-        return seen.replace(objects=jax.tree.map(lambda a: a[np.array(self.order)], seen.objects))
+        objects, confidence = jax.tree.map(lambda a: a[np.array(self.order)], (seen.objects, seen.confidence))
+        return seen.replace(objects=objects, confidence=confidence)
 
 
 def grab_nearest(key, problem, belief, observation):

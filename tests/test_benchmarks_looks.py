@@ -2,15 +2,27 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.looks import looks, scoring
+from mechsearch_jax.benchmarks.looks import looks, pictures, scoring
 from mechsearch_jax.benchmarks.looks.scoring import failure_kind, gaps, matched, phantom_kind, turned_by
+from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.world.mismatch import USUAL_COLOUR_NOISE, USUAL_HUE_GAP
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.images.cloud import thinned_view
+from mechsearch_jax.images.colour import RED
+from mechsearch_jax.perception.confidence import Measures
 from mechsearch_jax.perception.doubt import Thing
+from mechsearch_jax.perception.explanation import Fitted
+from mechsearch_jax.perception.hypotheses import SLOTS
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.scenario import Body, example_scenarios, load_scenario
+from mechsearch_jax.workspace.scenario import Body, example_scenarios, load_scenario, superquadrics
+
+WORKCELL = Workcell()
 
 
 def turn(degrees):
@@ -64,18 +76,60 @@ def test_gaps_between_bodies():
     np.testing.assert_allclose(gaps(bodies), [0.04, 0.04, 1.0], atol=1e-6)
 
 
-def test_an_image_has_the_sensors_noise():
-    workcell, scenario = Workcell(), load_scenario(example_scenarios()["first-light"])
-    picture = looks.taken(workcell, scenario)
+@pytest.fixture(scope="module")
+def scene():
+    """A scene whose target is in sight, and its image."""
+    scenario = load_scenario(example_scenarios()["first-light"])
+    x, _, z = scenario.target.position
+    in_sight = dataclasses.replace(scenario, target=dataclasses.replace(scenario.target, position=(x, -0.03, z)))
+    return in_sight, pictures.taken(WORKCELL, in_sight)
+
+
+def test_an_image_has_the_sensors_noise(scene):
+    scenario, picture = scene
     seen = np.isfinite(picture.depth)
-    clean, noisy = (looks.noisy(workcell, picture, noise, 1) for noise in ("clean", "gaussian"))
+    clean, noisy = (pictures.noisy_depth(WORKCELL, picture, noise, 1) for noise in ("clean", "gaussian"))
     np.testing.assert_array_equal(clean[seen], picture.depth[seen])
     assert (clean[~seen] == 0).all()
     assert np.std((noisy - clean)[seen]) == pytest.approx(0.001, rel=0.05)
     with pytest.raises(InputError, match='noise "loud" is unknown'):
-        looks.noisy(workcell, picture, "loud", 1)
+        pictures.noisy_depth(WORKCELL, picture, "loud", 1)
     shown = {int(slot) for slot in np.unique(picture.owner)} & set(range(len(scenario.objects)))
     assert len(shown) > 1
+
+
+def test_colours_are_those_of_an_episode(scene):
+    """MuJoCo's image and the package's own have the same colours wherever they show the same."""
+    scenario, picture = scene
+    world = from_scenario(scenario)
+    own = observe(WORKCELL.camera, world, WORKCELL.shelf, drawn_appearance(scene_key(world), RED, USUAL_HUE_GAP))
+    alike = (np.asarray(own.segmentation) == picture.owner) & (picture.owner >= 0) & (picture.owner <= TARGET)
+    alike[alike] = np.abs(np.asarray(own.depth)[alike] - picture.depth[alike]) < 1e-3
+    assert len(np.unique(picture.owner[alike])) > 3
+    levels = 255 * np.asarray(own.colour)[alike] - picture.colour[alike]
+    assert np.quantile(np.abs(levels), 0.99) < 2
+    noise = pictures.noisy_colour(picture, 1)[alike].astype(float) - picture.colour[alike]
+    assert np.std(noise) == pytest.approx(255 * USUAL_COLOUR_NOISE, rel=0.05)
+
+
+def test_an_object_that_stands_for_a_found_target_is_a_phantom(scene):
+    scenario, picture = scene
+    view = thinned_view(WORKCELL.camera, WORKCELL.shelf)
+    labels = np.asarray(view.of(jnp.asarray(picture.owner)))
+    truth = superquadrics([scenario.target], SLOTS)
+    zeros = np.zeros(SLOTS)
+    measures = Measures(truth.valid, zeros, zeros, zeros, zeros)
+    fitted = Fitted(truth, np.zeros(3), np.full(SLOTS, 0.9), measures, labels, np.zeros(SLOTS, bool))
+    kind = "explained", "clean"
+    counts = [len(looks.judged(scenario, picture, kind, fitted, visible, view.of)[1]) for visible in (False, True)]
+    assert counts == [0, 1]
+
+
+def test_missed_and_false_targets_are_counted():
+    seen = [(500, True, True), (400, True, False), (20, False, True), (0, False, False)]
+    sightings = [scoring.Sighting("", "explained", "clean", *row) for row in seen]
+    counts = scoring.detection_counts(sightings)
+    assert counts == {"targets_in_sight": 2, "targets_missed": 1, "targets_false": 1}
 
 
 def test_a_bench_of_nothing_is_refused():
@@ -84,11 +138,17 @@ def test_a_bench_of_nothing_is_refused():
 
 
 @pytest.mark.slow
-def test_true_segments_of_a_simple_scene_are_all_right():
-    scenario = load_scenario(example_scenarios()["first-light"])
-    picture = looks.taken(Workcell(), scenario)
-    measured = looks.Bench({scenario.name: (scenario, picture)}, ("clean",), ("true",)).run()
-    everything = measured.summary()[0]
-    assert everything["wrong"] == everything["phantoms"] == 0
-    assert everything["objects"] == len(measured.rows) == sum(row.pixels >= scoring.PIXELS for row in measured.rows)
-    assert {dataclasses.asdict(row)["kind"] for row in measured.rows} == {""}
+def test_a_simple_scene_is_all_right_and_its_target_is_seen(scene):
+    scenario, picture = scene
+    bench = looks.Bench({scenario.name: scene}, ("gaussian",), ("explained", "true"))
+    measured = bench.run()
+    lines = [line for line in measured.summary() if "looks" in line]
+    assert [line["segments"] for line in lines] == ["explained", "true"]
+    for line in lines:
+        assert line["wrong"] == line["phantoms"] == 0
+        assert (line["targets_in_sight"], line["targets_missed"], line["targets_false"]) == (1, 0, 0)
+        assert line["objects"] == sum(
+            (picture.owner == i).sum() >= scoring.PIXELS for i in range(len(scenario.objects))
+        )
+    assert {row.kind for row in measured.rows} == {""}
+    assert [sighting.pixels for sighting in measured.sightings] == 2 * [(picture.owner == TARGET).sum()]

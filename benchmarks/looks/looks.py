@@ -1,7 +1,7 @@
-"""What comes of a depth image alone: every visible object, end to end, from another renderer's images.
+"""What comes of a depth and a colour image alone: every visible object, end to end, from another renderer's images.
 
-MuJoCo casts the rays, and a sensor's noise is added. The recogniser gets the whole camera image and nothing else.
-Its objects are compared with the true bodies.
+MuJoCo casts the rays, and the sensors' noise is added. The recogniser gets the whole images, as recognition `full` does
+in an episode, knows the target's shape and colour, and nothing else. Its objects are compared with the true bodies.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from mechsearch_jax.benchmarks.looks.pictures import Picture, noisy_colour, noisy_depth
 from mechsearch_jax.benchmarks.looks.scoring import (
     OFF,
     PIXELS,
@@ -27,7 +28,9 @@ from mechsearch_jax.benchmarks.looks.scoring import (
     TURNED,
     Phantom,
     Row,
+    Sighting,
     bordering,
+    detection_counts,
     failure_kind,
     gaps,
     matched,
@@ -35,10 +38,9 @@ from mechsearch_jax.benchmarks.looks.scoring import (
     thing_of,
     turned_by,
 )
-from mechsearch_jax.envs.cell.simulated_cell import SensorNoise, SimulatedCell
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.images.noise import TimeOfFlight, depth_of
+from mechsearch_jax.images.labels import FREE
 from mechsearch_jax.perception.doubt import Thing
 from mechsearch_jax.perception.explanation import Explaining, ExplanationConfig, Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.recogniser import Recogniser
@@ -46,6 +48,7 @@ from mechsearch_jax.perception.scores import EDGE, intersection_over_union, shar
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.scenario import Body, Scenario, superquadrics
 
 NoiseName = Literal["clean", "gaussian", "time-of-flight"]
@@ -69,46 +72,6 @@ TIMES: Mapping[str, Callable[[Any], Any]] = {
 }
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Picture:
-    """An image of a scene before noise.
-
-    Attributes:
-      depth: [m], shape (H, W); infinite where nothing is.
-      owner: the body's slot of each pixel, the target last; larger or negative for anything else.
-    """
-
-    depth: Float[np.ndarray, "h w"]
-    owner: Int[np.ndarray, "h w"]
-
-
-def taken(workcell: Workcell, scenario: Scenario) -> Picture:
-    """The image of a scene, by MuJoCo's ray-casting; the arm is at home."""
-    cell = SimulatedCell(workcell, scenario, noise=SensorNoise(0.0, 0.0, 0.0))
-    depth, owner = cell.shown()
-    return Picture(depth.astype(np.float32), owner.astype(np.int8))
-
-
-def noisy(workcell: Workcell, picture: Picture, noise: str, seed: int) -> Float[np.ndarray, "h w"]:
-    """The depth image as a sensor measures it [m]; 0 where nothing was measured.
-
-    Raises:
-      InputError: the noise is unknown.
-    """
-    depth = picture.depth
-    match noise:
-        case "clean":
-            measured = depth
-        case "gaussian":
-            measured = depth + np.random.default_rng(seed).normal(0.0, 0.001, depth.shape)
-        case "time-of-flight":
-            points = TimeOfFlight()(jax.random.key(seed), workcell.camera, jnp.asarray(depth))
-            measured = np.asarray(depth_of(workcell.camera, points))
-        case _:
-            raise InputError(f'bench looks: noise "{noise}" is unknown; use clean, gaussian or time-of-flight')
-    return np.where(np.isfinite(measured), measured, 0.0).astype(np.float32)
-
-
 @jax.jit
 def _volumes(truth: Superquadrics, answers: Superquadrics) -> Float[jax.Array, "n m"]:
     """Intersection over union of every body with every recognised object."""
@@ -125,6 +88,7 @@ class Measured:
     Attributes:
       rows: one for every visible object of every look.
       phantoms: of all looks.
+      sightings: of the target, one for every look.
       seconds: of each look, from image to observation, by the segments [s].
       compile_seconds: of the first look, minus the median of the others, by the segments [s].
       settings: scenes, noises, segments and seed.
@@ -133,17 +97,19 @@ class Measured:
 
     rows: tuple[Row, ...]
     phantoms: tuple[Phantom, ...]
+    sightings: tuple[Sighting, ...]
     seconds: dict[str, tuple[float, ...]]
     compile_seconds: dict[str, float]
     settings: dict[str, Any]
     versions: dict[str, str]
 
     def summary(self) -> list[dict[str, Any]]:
-        """Counts by segments and noise: of all objects, by pixels, by contact and by number of objects."""
+        """Counts by segments and noise: of all objects and targets, by pixels, by contact and by number of objects."""
         lines = []
         for segments, noise in dict.fromkeys((row.segments, row.noise) for row in self.rows):
             rows = [row for row in self.rows if (row.segments, row.noise) == (segments, noise)]
             phantoms = [p for p in self.phantoms if (p.segments, p.noise) == (segments, noise)]
+            sightings = [s for s in self.sightings if (s.segments, s.noise) == (segments, noise)]
             groups: dict[str, Sequence[Row]] = {"all": rows}
             groups |= {f"{name} pixels": [r for r in rows if low <= r.pixels < high] for name, low, high in SIZES}
             groups["touching"] = [row for row in rows if row.gap < TOUCHING]
@@ -156,6 +122,7 @@ class Measured:
                 "looks": len({row.scene for row in rows}),
                 "phantoms": len(phantoms),
                 "phantom_kinds": dict(Counter(phantom.kind for phantom in phantoms)),
+                **detection_counts(sightings),
             }
             lines += [kind | {"group": name} | figures(chosen) for name, chosen in groups.items() if chosen]
             lines[-sum(map(bool, groups.values()))] |= everything
@@ -219,10 +186,10 @@ class Bench:
     Attributes:
       pictures: images of scenes by name, each with its scenario.
       noises: of `NoiseName`.
-      segments: one or more of `Segments`: "explained" or "network" for depth images alone, with and without
+      segments: one or more of `Segments`: "explained" or "network" for what the images show alone, with and without
         `perception.explanation`, "joined" where it divides no segment; "true" for the true masks beside them.
       seed: of the noise and of the recogniser.
-      workcell: camera and shelf; its target is what the recogniser knows.
+      workcell: camera and shelf; its target is what the recogniser knows, and that it is `images.colour.RED`.
     """
 
     pictures: Mapping[str, tuple[Scenario, Picture]]
@@ -250,15 +217,20 @@ class Bench:
             kind: Recogniser(self.workcell, fitter=FITTERS[kind]) for kind in self.segments
         }
         start = next(iter(self.pictures)), self.noises[0]
-        first = {kind: self.look(recogniser, kind, *start)[1] for kind, recogniser in recognisers.items()}
+        first = {kind: self.look(recogniser, kind, *start)[-1] for kind, recogniser in recognisers.items()}
         rows: list[Row] = []
         phantoms: list[Phantom] = []
+        sightings: list[Sighting] = []
         seconds: dict[Segments, list[float]] = {kind: [] for kind in recognisers}
         for done, (noise, name, kind) in enumerate(itertools.product(self.noises, self.pictures, recognisers)):
-            fitted, spent = self.look(recognisers[kind], kind, name, noise)
-            scored, extra = judged(*self.pictures[name], (kind, noise), fitted, recognisers[kind].view.of)
+            fitted, visible, spent = self.look(recognisers[kind], kind, name, noise)
+            scenario, picture = self.pictures[name]
+            scored, extra = judged(scenario, picture, (kind, noise), fitted, visible, recognisers[kind].view.of)
             rows += scored
             phantoms += extra
+            shown = int((picture.owner == TARGET).sum())
+            in_sight = shown > found_pixels(self.workcell.camera)
+            sightings.append(Sighting(scenario.name, kind, noise, shown, in_sight, visible))
             seconds[kind].append(spent)
             on_progress(done + 1)
         settings = {
@@ -273,21 +245,23 @@ class Bench:
             kind: round(max(first[kind] - statistics.median(seconds[kind]), 0.0), 2) for kind in seconds
         }
         times: dict[str, tuple[float, ...]] = {kind: tuple(values) for kind, values in seconds.items()}
-        return Measured(tuple(rows), tuple(phantoms), times, compiling, settings, versions())
+        return Measured(tuple(rows), tuple(phantoms), tuple(sightings), times, compiling, settings, versions())
 
-    def look(self, recogniser: Recogniser, kind: Segments, name: str, noise: str) -> tuple[Fitted, float]:
-        """One look: what the recogniser made of the image, and its time [s]."""
+    def look(self, recogniser: Recogniser, kind: Segments, name: str, noise: str) -> tuple[Fitted, bool, float]:
+        """One look: what the recogniser made of the images, whether it sees the target, and its time [s]."""
         index = list(self.pictures).index(name)
         picture = self.pictures[name][1]
-        depth = noisy(self.workcell, picture, noise, self.seed * 100_003 + index)
-        masks: dict[str, Any] = {}
+        seed = self.seed * 100_003 + index
+        images: dict[str, Any] = {"depth": noisy_depth(self.workcell, picture, noise, seed)}
         if kind == "true":
             shown = (picture.owner >= 0) & (picture.owner <= TARGET)
-            masks = {"mask": np.where(shown, picture.owner, -2).astype(np.int8), "target_id": TARGET}
+            images |= {"mask": np.where(shown, picture.owner, FREE).astype(np.int8), "target_id": TARGET}
+        else:
+            images["colour"] = noisy_colour(picture, seed)
         key = jax.random.fold_in(jax.random.key(self.seed), index)
         start = time.perf_counter()
-        fitted, _ = jax.block_until_ready(recogniser.fitted(key, depth, **masks))
-        return fitted, time.perf_counter() - start
+        fitted, visible = jax.block_until_ready(recogniser.fitted(key, **images))
+        return fitted, bool(visible), time.perf_counter() - start
 
 
 def judged(
@@ -295,6 +269,7 @@ def judged(
     picture: Picture,
     kind: tuple[str, str],
     fitted: Fitted,
+    visible: bool,
     view: Callable[[Any], Any],
 ) -> tuple[list[Row], list[Phantom]]:
     """The outcomes of a look.
@@ -303,21 +278,22 @@ def judged(
       scenario, picture: the truth.
       kind: names of the segments and of the noise.
       fitted: what was made of it, without batch axes.
+      visible: whether the target was detected; if so, no object may stand for it.
       view: cuts the recogniser's view out of an image.
     """
     bodies: list[Body] = [*scenario.objects, scenario.target]
-    slots = [*range(len(scenario.objects)), TARGET]
     objects, segments, confidence = fitted.objects, np.asarray(fitted.labels), np.asarray(fitted.confidence)
     answers = np.flatnonzero(np.asarray(objects.valid))
     iou = np.asarray(_volumes(superquadrics(bodies, TARGET + 1), objects))[: len(bodies), answers]
     places = np.array([body.position for body in bodies])
     distance = np.linalg.norm(places[:, None] - np.asarray(objects.position, float)[None, answers], axis=-1)
-    chosen, stands_for_one = matched(iou, distance)
-    owner = np.asarray(view(picture.owner))
+    count = len(scenario.objects) if visible else len(bodies)
+    chosen, stands_for_one = matched(iou[:count], distance[:count])
+    owner = np.asarray(view(jnp.asarray(picture.owner)))
     apart = gaps(bodies)
     rows = []
-    for i, (slot, body) in enumerate(zip(slots[:-1], bodies, strict=False)):
-        pixels = int((picture.owner == slot).sum())
+    for i, body in enumerate(scenario.objects):
+        pixels = int((picture.owner == i).sum())
         if pixels < PIXELS:
             continue
         answer = None if chosen[i] < 0 else int(answers[chosen[i]])
@@ -333,16 +309,16 @@ def judged(
         rows.append(
             Row(
                 scene=scenario.name,
-                object=slot,
+                object=i,
                 objects=len(scenario.objects),
                 segments=kind[0],
                 noise=kind[1],
                 shape=body.shape,
                 pixels=pixels,
                 gap=round(float(apart[i]), 4),
-                beside=bordering(owner, slot),
+                beside=bordering(owner, i),
                 outcome=outcome,
-                kind="" if outcome == "right" else failure_kind(slot, owner, segments),
+                kind="" if outcome == "right" else failure_kind(i, owner, segments),
                 centre=None if centre is None else round(centre, 4),
                 angle=None if angle is None else round(angle, 1),
                 iou=0.0 if answer is None else round(float(iou[i, chosen[i]]), 4),

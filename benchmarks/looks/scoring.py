@@ -92,6 +92,33 @@ class Phantom:
     confidence: float
 
 
+@dataclasses.dataclass(frozen=True)
+class Sighting:
+    """Whether a look detected the target.
+
+    Attributes:
+      scene, segments, noise: of the look.
+      pixels: number of pixels of the full image that show it.
+      in_sight: whether these are enough to detect it, see `workspace.detector.found_pixels`.
+      detected: whether it was.
+    """
+
+    scene: str
+    segments: str
+    noise: str
+    pixels: int
+    in_sight: bool
+    detected: bool
+
+
+def detection_counts(sightings: Sequence[Sighting]) -> dict[str, int]:
+    """How many targets are in sight, how many of them are missed, and how many are detected that are not in sight."""
+    in_sight = [sighting for sighting in sightings if sighting.in_sight]
+    missed = sum(not sighting.detected for sighting in in_sight)
+    false = sum(sighting.detected for sighting in sightings if not sighting.in_sight)
+    return {"targets_in_sight": len(in_sight), "targets_missed": missed, "targets_false": false}
+
+
 def thing_of(name: str, body: Body) -> Thing:
     """A true body as a `Thing`."""
     return Thing(

@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
 
 def looks_tables(measured: looks.Measured) -> Group:
-    """What comes of depth images alone, for all segments and noises: by pixels, contact and number of objects, and how
-    often objects are wrong by their stated confidence."""
+    """What comes of depth and colour images alone, for all segments and noises: by pixels, contact and number of
+    objects, and how often objects are wrong by their stated confidence."""
     tables: list[Table] = []
     for line in measured.summary():
         if "looks" in line:
-            tables.append(
-                plain_table(f"{line['segments']}, {line['noise']}: {line['looks']} looks, {line['phantoms']} phantoms")
+            title = (
+                f"{line['segments']}, {line['noise']}: {line['looks']} looks, {line['phantoms']} phantoms; targets: "
+                f"{line['targets_in_sight']} in sight, {line['targets_missed']} missed, {line['targets_false']} false"
             )
+            tables.append(plain_table(title))
             for name in ("objects", "counted", "wrong", "missing", "off", "turned", "IoU", "kinds"):
                 tables[-1].add_column(name, justify="left" if name in ("objects", "kinds") else "right")
         numbers = [str(line[name]) for name in ("objects", "wrong", "missing", "off", "turned")]

@@ -175,7 +175,7 @@ class SimulatedCell:
 
     def look(self) -> Look:
         """Take a depth and a colour image, registered to each other."""
-        depth, normal, owner = self._cast()
+        depth, normal, owner = self.shown()
         light = np.array(LIGHT) / np.linalg.norm(LIGHT)
         shade = AMBIENT + (1.0 - AMBIENT) * np.maximum(normal @ light, 0.0)
         colour = self._colours[owner] * np.where(owner == NOTHING, 1.0, shade)[..., None]
@@ -187,15 +187,9 @@ class SimulatedCell:
             np.round(255 * np.clip(colour, 0.0, 1.0)).astype(np.uint8),
         )
 
-    def shown(self) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-        """The true depth of every pixel [m], infinite where nothing is, and its owner: a body's slot, the target last,
-        or a larger or negative number for anything else."""
-        depth, _, owner = self._cast()
-        return depth, owner
-
     def target_pixels(self) -> int:
         """Number of pixels of the target that the camera sees."""
-        return int(np.sum(self._cast()[2] == TARGET))
+        return int(np.sum(self.shown()[2] == TARGET))
 
     def follow(self, trajectory: RobotTrajectory) -> Followed:
         """Follow a trajectory from where the arm is to its end, and let everything come to rest.
@@ -232,8 +226,9 @@ class SimulatedCell:
         finger = width / 2 - force / models.FINGER_STIFFNESS
         return np.concatenate([arm, [finger, finger]])
 
-    def _cast(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"], Int[np.ndarray, "h w"]]:
-        """Depth [m], outward normal and owner of every pixel."""
+    def shown(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"], Int[np.ndarray, "h w"]]:
+        """The true depth of every pixel [m], infinite where nothing is, its surface's outward normal, and its owner: a
+        body's slot, the target last, `SHELF`, `ROBOT_LINK` or `NOTHING`."""
         camera = self.workcell.camera
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         inverse = np.linalg.inv([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import above_board, draw
 from mechsearch_jax.images.labels import OTHER
@@ -222,7 +222,8 @@ def select_objects(
         possible = moves.possible & jnp.all(~moves.removed | selected[None], axis=1)
         possible &= jnp.all(~moves.added | scene.valid[None], axis=1)
         possible &= jnp.sum(after & ~of_target[None], axis=1) <= SLOTS
-        costs_after = masked_vmap(lambda _, table, row: _total(table, row), possible, None, table, after, block=1)
+        block = 1 if on_cpu() else SLOTS
+        costs_after = masked_vmap(lambda _, table, row: _total(table, row), possible, None, table, after, block=block)
         return after, jnp.where(possible, present - costs_after, -jnp.inf)
 
     def step(state):

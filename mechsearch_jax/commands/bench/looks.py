@@ -1,4 +1,4 @@
-"""`mechsearch bench looks`: what comes of depth images alone, end to end."""
+"""`mechsearch bench looks`: what comes of depth and colour images alone, end to end."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def bench_looks(
     seed: int = 0,
     out: JsonFile = None,
 ) -> None:
-    """Measure what comes of a depth image alone: which visible objects are missing, off or turned, phantoms, and how
-    often objects are wrong by their stated confidence.
+    """Measure what comes of a depth and a colour image alone: which visible objects are missing, off or turned,
+    phantoms, missed targets, and how often objects are wrong by their stated confidence.
 
-    MuJoCo renders the images, not the package's own camera.
+    MuJoCo renders the images, not the package's own camera. The target is red, the objects have random colors.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
@@ -41,6 +41,7 @@ def bench_looks(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.looks import looks
+    from mechsearch_jax.benchmarks.looks.pictures import taken
     from mechsearch_jax.benchmarks.report.looks_tables import looks_tables
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.runtime.files import save_json
@@ -53,7 +54,7 @@ def bench_looks(
         pictures = {}
         for number, file in enumerate(files):
             scenario = load_scenario(file)
-            pictures[scenario.name] = scenario, looks.taken(Workcell(), scenario)
+            pictures[scenario.name] = scenario, taken(Workcell(), scenario)
             status.update(f"rendering {number + 1}/{len(files)}")
         bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
         forget_kept_compilations()
