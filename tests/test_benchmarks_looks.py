@@ -81,7 +81,7 @@ def scene():
     """A scene whose target is in sight, and its image."""
     scenario = load_scenario(example_scenarios()["first-light"])
     x, _, z = scenario.target.position
-    in_sight = dataclasses.replace(scenario, target=dataclasses.replace(scenario.target, position=(x, -0.03, z)))
+    in_sight = dataclasses.replace(scenario, target=dataclasses.replace(scenario.target, position=(x, -0.06, z)))
     return in_sight, pictures.taken(WORKCELL, in_sight)
 
 

@@ -64,9 +64,9 @@ def measures_of(
       costs: what a point or ray costs.
     """
     pixels = pixels_of(labels)
-    own = (labels.reshape(-1)[None] == jnp.arange(SLOTS)[:, None]) & sample.judged.reshape(1, -1)
-    flat = jnp.where(own.any(axis=0)[:, None], image.points.reshape(-1, 3), 0.0)
-    badly = jnp.sum(jnp.where(own, point_cost(surface_distance(objects, flat), sample, costs), 0.0), axis=1)
+    member = (labels.reshape(-1)[None] == jnp.arange(SLOTS)[:, None]) & sample.judged.reshape(1, -1)
+    flat = jnp.where(member.any(axis=0)[:, None], image.points.reshape(-1, 3), 0.0)
+    badly = jnp.sum(jnp.where(member, point_cost(surface_distance(objects, flat), sample, costs), 0.0), axis=1)
     return Measures(
         valid=objects.valid,
         pixels=pixels,

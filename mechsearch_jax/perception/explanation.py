@@ -199,12 +199,12 @@ def explained_image(
         rotation=yaw_rotation(pose[2])[None],
         valid=has_pixels[None],
     )
-    found = _Found(body, pose, on_it)
-    return _explain(keys[0], image, found, (shapes, camera, shelf, refinement), config, least)
+    fitted_target = _FittedTarget(body, pose, on_it)
+    return _explain(keys[0], image, fitted_target, (shapes, camera, shelf, refinement), config, least)
 
 
-class _Found(flax.struct.PyTreeNode):
-    """The target: one slot, absent if it is not visible; its pose, and the pixels on it."""
+class _FittedTarget(flax.struct.PyTreeNode):
+    """The target: its body in one slot, absent if it is not visible; its pose; and the pixels on it."""
 
     body: Superquadrics
     pose: jax.Array
@@ -214,13 +214,13 @@ class _Found(flax.struct.PyTreeNode):
 def _explain(
     key: Array,
     image: LabelledImage,
-    found: _Found,
+    fitted_target: _FittedTarget,
     settings: tuple[ShapeNetwork, Camera, Shelf, RefinementConfig],
     config: ExplanationConfig,
     least: Float[Array, ""] | float,
 ) -> Fitted:
     """`explained_image` for a fitted target."""
-    keys, body = jax.random.split(key, 3), found.body
+    keys, body = jax.random.split(key, 3), fitted_target.body
     slots = jnp.arange(SLOTS, dtype=image.labels.dtype)
     segments = image.labels[None] == slots[:, None, None]
     base, base_error = fitted(keys[0], image, segments, jnp.any(segments, axis=(1, 2)), *settings)
@@ -230,8 +230,8 @@ def _explain(
     image = image.replace(labels=_without(image.labels, ~base.valid))
     sample = sample_of(keys[1], image, base, *settings[1:3], config)
     pixels = pixels_of(image.labels)
-    of_own = sample.label[None] == jnp.arange(SLOTS)[:, None]
-    badly = jnp.sum(point_cost(surface_distance(base, sample.points), sample, config) * of_own, axis=1) * sample.weight
+    belongs = sample.label[None] == jnp.arange(SLOTS)[:, None]
+    badly = jnp.sum(point_cost(surface_distance(base, sample.points), sample, config) * belongs, axis=1) * sample.weight
     bad = jnp.where(base.valid, badly + passed(base, sample, config), 0.0)
     doubtful = (bad > config.doubtful) & (bad > config.doubtful_share * pixels)
 
@@ -251,7 +251,7 @@ def _explain(
     low, high = pair // SLOTS, pair % SLOTS
     joined = (likely > 0.0) & base.valid[low] & base.valid[high]
     union = (image.labels[None] == low[:, None, None]) | (image.labels[None] == high[:, None, None])
-    of_target = 2 * jnp.sum(halves & found.on_it[None], axis=(1, 2)) > jnp.sum(halves, axis=(1, 2))
+    of_target = 2 * jnp.sum(halves & fitted_target.on_it[None], axis=(1, 2)) > jnp.sum(halves, axis=(1, 2))
     of_target &= counts <= jnp.sum(image.of_target)
     active = jnp.concatenate([jnp.repeat(divided, 2) & (counts > least) & ~of_target, joined])
     fits, error = fitted(keys[2], image, jnp.concatenate([halves, union]), active, *settings)
@@ -260,7 +260,7 @@ def _explain(
 
     selection = select_objects(everything, moves_of(chosen, divided, (low, high), joined), sample, pixels, config)
     errors = jnp.concatenate([base_error, error, jnp.zeros(1)])
-    return _chosen(everything, errors, selection, image, found, sample, config)
+    return _chosen(everything, errors, selection, image, fitted_target, sample, config)
 
 
 def _without(labels: Int[Array, "h w"], absent: Bool[Array, " 8"]) -> Int[Array, "h w"]:
@@ -274,7 +274,7 @@ def _inside(scene: Superquadrics, body: Superquadrics) -> Bool[Array, " n"]:
 
     Args:
       scene: the objects.
-      body: the target, one slot; absent if it is not found.
+      body: the target, one slot; absent if it is not fitted_target.
     """
     level = scene.position.at[:, 2].set(body.position[0, 2])
     return (surface_distance(body, level)[0] < 0.0) & body.valid[0]
@@ -285,7 +285,7 @@ def _chosen(
     errors: Float[Array, " c"],
     selection: Selection,
     image: LabelledImage,
-    found: _Found,
+    fitted_target: _FittedTarget,
     sample: Sample,
     config: ExplanationConfig,
 ) -> Fitted:
@@ -305,7 +305,7 @@ def _chosen(
     flat = jnp.where((labels == MISSING).reshape(-1, 1), 0.0, image.points.reshape(-1, 3))
     near = jnp.where(scene.valid[:, None], jnp.abs(surface_distance(scene, flat)), jnp.inf)
     nearest = jnp.where(jnp.min(near, axis=0) < sample.exact + config.wrong, jnp.argmin(near, axis=0), OTHER)
-    nearest = jnp.where(found.on_it, OTHER, nearest.reshape(labels.shape))
+    nearest = jnp.where(fitted_target.on_it, OTHER, nearest.reshape(labels.shape))
     labels = jnp.where(gone, nearest, labels).astype(labels.dtype)
     measures = measures_of(scene, labels, image, sample, errors[source], selection.margin[source], config)
-    return Fitted(standard_edges(scene), found.pose, confidence_of(measures), measures, labels, filled)
+    return Fitted(standard_edges(scene), fitted_target.pose, confidence_of(measures), measures, labels, filled)

@@ -117,8 +117,8 @@ def sample_of(
     free = jnp.where(jnp.isnan(seen), 0.0, jnp.minimum(seen, FAR))
     label = jnp.where(total > 0, image.labels.reshape(-1)[index], OTHER).astype(jnp.int32)
     points = jnp.where(total > 0, image.points.reshape(-1, 3)[index], 0.0)
-    own = jnp.abs(surface_distance(base, points))[jnp.maximum(label, 0), jnp.arange(costs.points)]
-    usual = jnp.nanmedian(jnp.where((label >= 0) & base.valid[jnp.maximum(label, 0)], own, jnp.nan))
+    off = jnp.abs(surface_distance(base, points))[jnp.maximum(label, 0), jnp.arange(costs.points)]
+    usual = jnp.nanmedian(jnp.where((label >= 0) & base.valid[jnp.maximum(label, 0)], off, jnp.nan))
     return Sample(
         points=points,
         label=label,
@@ -171,13 +171,13 @@ def moves_of(
     count = len(divided)
     capacity = SLOTS + 2 * count + len(joined) + 1
     of_segment = jax.nn.one_hot(jnp.repeat(chosen, WAYS), capacity, dtype=bool)
-    one, other = (jax.nn.one_hot(SLOTS + 2 * jnp.arange(count) + i, capacity, dtype=bool) for i in (0, 1))
+    first, second = (jax.nn.one_hot(SLOTS + 2 * jnp.arange(count) + i, capacity, dtype=bool) for i in (0, 1))
     merged = [jax.nn.one_hot(slots, capacity, dtype=bool) for slots in pair]
     union = jax.nn.one_hot(SLOTS + 2 * count + jnp.arange(len(joined)), capacity, dtype=bool)
     each = jnp.eye(capacity, dtype=bool)[:-1]
     return Moves(
         removed=jnp.concatenate([of_segment, of_segment, of_segment, merged[0] | merged[1], each]),
-        added=jnp.concatenate([one | other, one, other, union, jnp.zeros_like(each)]),
+        added=jnp.concatenate([first | second, first, second, union, jnp.zeros_like(each)]),
         possible=jnp.concatenate([divided, divided, divided, joined, jnp.ones(len(each), bool)]),
     )
 

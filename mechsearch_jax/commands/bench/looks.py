@@ -11,6 +11,7 @@ from mechsearch_jax.commands.options import (
     find_scenarios,
     forget_kept_compilations,
 )
+from mechsearch_jax.runtime.errors import InputError
 
 Noise = Literal["clean", "gaussian", "time-of-flight"]
 Segments = Literal["network", "explained", "joined", "true"]
@@ -37,6 +38,9 @@ def bench_looks(
         true masks; several are looked at in turn.
       seed: of the noise and of the recogniser.
       out: JSON file for the figures, and for every object that is not right.
+
+    Raises:
+      InputError: two scenarios have the same name, or the file cannot be written.
     """
     from rich.console import Console
 
@@ -54,6 +58,8 @@ def bench_looks(
         pictures = {}
         for number, file in enumerate(files):
             scenario = load_scenario(file)
+            if scenario.name in pictures:
+                raise InputError(f"bench looks: {file}: another scenario is named {scenario.name!r}, too; rename it")
             pictures[scenario.name] = scenario, taken(Workcell(), scenario)
             status.update(f"rendering {number + 1}/{len(files)}")
         bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
