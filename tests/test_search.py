@@ -38,6 +38,7 @@ from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.session.searcher import DRAWS, Searcher
+from mechsearch_jax.session.state import beginning
 from mechsearch_jax.session.step import Motion
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
@@ -457,6 +458,19 @@ def test_a_saved_search_goes_on_where_it_was(problem, tmp_path):
     third.load(path)
     third.acted()
     assert third.finished
+
+
+def test_a_search_that_was_saved_before_objects_said_how_sure_they_are_goes_on(problem, tmp_path):
+    path, new, old = tmp_path / "search.npz", searcher_of(problem, OPEN), searcher_of(problem, OPEN)
+    new._state = dataclasses.replace(beginning(problem), observation=seen(OPEN), index=3)
+    new.save(path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file if name != "['observation'].confidence"}
+        assert len(arrays) == len(file.files) - 1
+    np.savez(path, **arrays)
+    old.load(path)
+    assert old._now.index == 3
+    jax.tree.map(np.testing.assert_array_equal, old._now.observation, seen(OPEN))
 
 
 def test_a_saved_search_goes_on_with_another_hand_and_place(problem, tmp_path):

@@ -93,7 +93,12 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
         raise InputError(
             f"{path}: is of another workcell, configuration or seed; make the Searcher as it was made then"
         )
-    return _restored(beginning(problem), arrays, rest, path)
+    like = beginning(problem)
+    if "['observation'].confidence" not in arrays:
+        # Saved before objects said how sure they are.
+        like = dataclasses.replace(like, observation=like.observation.replace(confidence=None))
+    state = _restored(like, arrays, rest, path)
+    return dataclasses.replace(state, observation=state.observation.judged())
 
 
 def beginning(problem: Problem) -> State:
