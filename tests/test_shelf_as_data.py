@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.candidates import all_candidates
@@ -233,12 +234,12 @@ def test_images_are_recognised_by_one_program_for_both(two):
     again = second(KEY, images.depth, images.colour)
     assert [cache_size(part) for part in parts] == sizes
     assert bool(seen.target_visible) == bool(again.target_visible)
-    np.testing.assert_array_equal(seen.objects.valid, again.objects.valid)
-    assert int(seen.objects.valid.sum()) > 2
-    # The image is the same, and camera and shelf are said to be elsewhere: so are the objects. The fit of one that is
-    # hardly seen depends on the shelf.
-    gap = np.abs(seen.objects.position - again.objects.position)[np.asarray(seen.objects.valid)].max(axis=1)
-    assert 1e-5 < np.median(gap) < 0.02
+    places = [np.asarray(view.objects.position)[np.asarray(view.objects.valid)] for view in (seen, again)]
+    assert len(places[0]) == len(places[1]) > 2
+    # The image is the same, and camera and shelf are said to be elsewhere: so are the objects, whose order is the
+    # network's. The fit of one that is hardly seen depends on the shelf.
+    gaps = np.abs(places[0][:, None] - places[1][None]).max(axis=-1)
+    assert 1e-5 < np.median(gaps[linear_sum_assignment(gaps)]) < 0.02
 
 
 def test_bodies_of_trials_are_compiled_once_for_both_shelves():
