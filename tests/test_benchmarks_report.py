@@ -12,8 +12,9 @@ from rich.console import Console
 
 from mechsearch_jax.benchmarks.report import report
 from mechsearch_jax.benchmarks.report.episode_tables import events_table, rates_table
-from mechsearch_jax.benchmarks.report.report_figures import reached, success_figure
+from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
+from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.store.rows import EVENTS, Row, write_rows

@@ -199,8 +199,8 @@ def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
     assert len(re.findall(r"^\| [a-d] \| .* \| V\d\d \| all \|", text, re.MULTILINE)) == 96
     assert "see rates.csv" in text
     assert "| V96 | 1 | a |" not in text
-    # Rates by number of objects, and reasons by variant.
-    assert page.count("<details>") == 2
+    # Rates and actions by number of objects, and reasons by variant.
+    assert page.count("<details>") == 3
     with open(tmp_path / "key.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 96
@@ -208,7 +208,7 @@ def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
     with open(tmp_path / "rates.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == 96 * 3
     with open(tmp_path / "paired.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 95 * 6
+        assert len(list(csv.DictReader(file))) == 95 * 9
 
 
 class Checked(HTMLParser):

@@ -13,6 +13,7 @@ from rich.text import Text
 from mechsearch_jax.benchmarks.ceiling import solvability
 from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
+from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
 from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
@@ -82,6 +83,25 @@ def _shown(summary: Sequence[Any], key: Key) -> Sequence[Any]:
     if len(key.short) <= MOST_IN_FULL or list(summary[0].group) != [VARIANT, "objects"]:
         return summary
     return [each for each in summary if each.objects is None]
+
+
+def restricted_table(means: Sequence[RestrictedMeans], key: Key) -> Table:
+    """Restricted mean numbers of actions of at least one group."""
+    budget, retrieval = (horizon_of(goal, means[0].budget) for goal in ("found", "retrieved"))
+    table = plain_table(f"actions until then, never counted as {budget}, or {retrieval} for retrieved")
+    for name in means[0].group:
+        _add_group_column(table, name)
+    for name in ("runs", *GOALS):
+        table.add_column(name, justify="right", no_wrap=True)
+    for group in _shown(means, key):
+        values = [getattr(group, goal) for goal in GOALS]
+        table.add_row(
+            *_group(group.group, key),
+            str(group.episodes),
+            *("-" if value is None else f"{value:.1f}" for value in values),
+            style="bold" if None in group.group.values() else None,
+        )
+    return table
 
 
 def differences_table(differences: VariantDifferences, key: Key, baseline: str) -> Table:

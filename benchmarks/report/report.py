@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from mechsearch_jax.benchmarks.report.films import Film
 from mechsearch_jax.benchmarks.report.report_figures import curve_rates
+from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, restricted_means
 from mechsearch_jax.benchmarks.statistics.paired import PAIRED, VariantDifferences, paired
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
@@ -131,7 +132,8 @@ class Report:
       key: of their variants.
       rates: by the columns of the options, by default the variant and the number of objects.
       variants: by variant and number of objects.
-      events: likewise.
+      restricted: restricted mean numbers of actions, grouped as `rates` are.
+      events: by variant and number of objects.
       reasons: why episodes failed.
       curve_columns, curve: rates over a column; empty without that option.
       baseline, differences: paired differences from that variant, its label; None and empty without that option.
@@ -142,6 +144,7 @@ class Report:
     key: Key
     rates: Sequence[Rates]
     variants: Sequence[Rates]
+    restricted: Sequence[RestrictedMeans]
     events: Sequence[Events]
     reasons: Sequence[Failures]
     curve_columns: Sequence[str]
@@ -165,6 +168,7 @@ class Report:
             key=key,
             rates=summarise(rows, options.rows) if options.rows else by_variant,
             variants=by_variant,
+            restricted=restricted_means(rows, options.rows) if options.rows else restricted_means(rows),
             events=summarise_events(rows),
             reasons=failures(rows),
             curve_columns=[canonical(name) for name in options.curve],

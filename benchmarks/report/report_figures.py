@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import itertools
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, Rates, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
@@ -29,12 +29,6 @@ BEST, WORST = 3, 1
 MOST_CURVES = 20
 # Inches that a variant takes on an axis, and what a picture of them is at least and at most wide.
 EACH, NARROWEST, WIDEST = 0.13, 6.0, 14.0
-
-
-def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
-    """How many episodes had reached a goal after 0, 1, ..., `actions` actions."""
-    after = collections.Counter(step_of(row, goal) for row in rows)
-    return list(itertools.accumulate(after[k] for k in range(actions + 1)))
 
 
 def _plain(axes: Axes) -> None:
@@ -69,22 +63,26 @@ def shown_variants(rows: Sequence[Row], key: Key, baseline: str | None = None) -
 
 
 def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
-    """Share of episodes that reached each goal over the number of actions: a column for each number of objects."""
+    """Share of episodes that reached each goal over the number of actions: a column for each number of objects.
+
+    Where these are several, a last column has all of them together.
+    """
     key = Key.of(rows)
     groups: dict[tuple[str, int], list[Row]] = {}
     for row, label in zip(rows, label_variants(rows), strict=True):
         groups.setdefault((label, row.objects), []).append(row)
     shown, objects = shown_variants(rows, key, baseline), sorted({objects for _, objects in groups})
+    columns: list[int | None] = [*objects, None] if objects[1:] else [*objects]
     actions = max(max(row.steps for row in rows), 1)
-    size = (2.6 * len(objects) + 1.2, 2.2 * len(GOALS) + 0.9 + 0.2 * len(shown))
+    size = (2.6 * len(columns) + 1.2, 2.2 * len(GOALS) + 0.9 + 0.2 * len(shown))
     figure = Figure(figsize=(max(size[0], NARROWEST), size[1]), layout="constrained")
-    grid = figure.subplots(len(GOALS), len(objects), sharex=True, sharey=True, squeeze=False)
+    grid = figure.subplots(len(GOALS), len(columns), sharex=True, sharey=True, squeeze=False)
     for i, (goal, title) in enumerate(GOALS.items()):
-        for j, count in enumerate(objects):
+        for j, count in enumerate(columns):
             axes: Axes = grid[i][j]
             # Not found out anew for every one of a hundred curves.
             axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
-            curves = {label: rows for (label, n), rows in groups.items() if n == count}
+            curves = _curves(groups, count)
             for label in key.short:
                 if label not in shown and (group := curves.get(label)):
                     share = np.array(reached(group, goal, actions)) / len(group)
@@ -95,13 +93,24 @@ def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
             _plain(axes)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             if i == 0:
-                axes.set_title(f"{count} object{'' if count == 1 else 's'}", fontsize=10, color=INK)
+                axes.set_title(
+                    "all" if count is None else f"{count} object{'' if count == 1 else 's'}", fontsize=10, color=INK
+                )
             if i == len(GOALS) - 1:
                 axes.set_xlabel("actions", fontsize=9, color=INK)
             if j == 0:
                 axes.set_ylabel(f"share {title}", fontsize=9, color=INK)
     _legend(figure, grid, list(shown.values()))
     return figure
+
+
+def _curves(groups: Mapping[tuple[str, int], Sequence[Row]], objects: int | None) -> dict[str, list[Row]]:
+    """The rows of each variant with so many objects, by its label; all rows if None."""
+    curves: dict[str, list[Row]] = {}
+    for (label, count), rows in groups.items():
+        if objects in (None, count):
+            curves.setdefault(label, []).extend(rows)
+    return curves
 
 
 def _legend(figure: Figure, grid: Any, labels: Sequence[str], title: str = "") -> None:

@@ -15,6 +15,7 @@ from mechsearch_jax.benchmarks.pages.pages import as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report.report import Failures, Report
 from mechsearch_jax.benchmarks.report.report_figures import curve_figure, rates_figure, success_figure
 from mechsearch_jax.benchmarks.report.report_page import blocks
+from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT, label_variants
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
@@ -23,15 +24,15 @@ from mechsearch_jax.viz.drawing import save_figure
 
 # What every report consists of, and what one has with more options; the folder `films.FOLDER` holds pictures.
 FILES = (
-    *("report.md", "report.tex", "report.html", "rates.csv", "rates.json", "failures.csv", "events.csv", "key.csv"),
-    *("success.png", "rates.png"),
+    *("report.md", "report.tex", "report.html", "rates.csv", "rates.json", "actions.csv", "failures.csv", "events.csv"),
+    *("key.csv", "success.png", "rates.png"),
 )
 OPTIONAL_FILES = ("curve.csv", "curve.png", "paired.csv")
 DIFFERENCE_COLUMNS = ("method", "goal", "pairs", "scenes", "difference", "standard_error", "gains", "losses")
 
 
-def _record(group: Rates | Events) -> dict[str, Any]:
-    """Rates or events with one value a column."""
+def _record(group: Rates | RestrictedMeans | Events) -> dict[str, Any]:
+    """Rates, means or events with one value a column."""
     record: dict[str, Any] = {name: "all" if value is None else value for name, value in group.group.items()}
     for field in dataclasses.fields(group):
         value = getattr(group, field.name)
@@ -44,7 +45,7 @@ def _record(group: Rates | Events) -> dict[str, Any]:
 
 
 def _columns(kind: type, group: Sequence[str]) -> list[str]:
-    """The columns of a table of rates or events."""
+    """The columns of a table of rates, means or events."""
     names: list[str] = []
     for field in dataclasses.fields(kind):
         goal = field.name.removesuffix("_interval")
@@ -82,14 +83,22 @@ def _csv(records: Sequence[Mapping[str, Any]], columns: list[str] | None = None)
 def _tables(report: Report) -> dict[str, str]:
     """The files that hold figures, by their names."""
     rates, events, curve = ([_record(each) for each in part] for part in (report.rates, report.events, report.curve))
+    restricted = list(map(_record, report.restricted))
     reasons = [dataclasses.asdict(each) for each in report.reasons]
     differences = _difference_records(report)
-    value = {"rates": rates, "failures": reasons, "events": events, "key": dict(report.key.short)}
+    value = {
+        "rates": rates,
+        "actions": restricted,
+        "failures": reasons,
+        "events": events,
+        "key": dict(report.key.short),
+    }
     value |= {"curve": curve} if curve else {}
     value |= {"baseline": report.baseline, "paired": differences} if differences else {}
     files = {
         "rates.csv": _csv(rates, _columns(Rates, list(report.rates[0].group))),
         "rates.json": json.dumps(value, indent=1, allow_nan=False) + "\n",
+        "actions.csv": _csv(restricted, _columns(RestrictedMeans, list(report.restricted[0].group))),
         "failures.csv": _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
         "events.csv": _csv(events, _columns(Events, list(report.variants[0].group))),
         "key.csv": _csv(_key_records(report)),

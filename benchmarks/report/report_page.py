@@ -13,8 +13,9 @@ from mechsearch_jax.benchmarks.report.report import (
     chosen_scenes_remark,
     failure_reason,
 )
+from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
 from mechsearch_jax.benchmarks.statistics.intervals import Interval
-from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
+from mechsearch_jax.benchmarks.statistics.paired import RESTRICTED, STEPS, PairedDifference
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 
@@ -53,8 +54,7 @@ def blocks(report: Report) -> list[Block]:
         *_reasons(report),
         Heading("What happened on the way"),
         *_events(report),
-        Heading("Success over the number of actions"),
-        Picture("success.png", "Success over the number of actions"),
+        *_actions(report),
         *_films(report),
     ]
 
@@ -140,20 +140,21 @@ def _differences(report: Report) -> list[Block]:
             *(short[label], goals["found"].pairs),
             *(cell(goals[goal], 100.0, 1) for goal in GOALS),
             f"{goals['retrieved'].gains}, {goals['retrieved'].losses}",
-            *(cell(goals[f"{goal}_steps"], 1.0, 2) for goal in GOALS),
+            *(cell(goals[f"{goal}{ending}"], 1.0, 2) for ending in (STEPS, RESTRICTED) for goal in GOALS),
         )
         for label, goals in report.differences.items()
     ]
     header = (
         *("variant", "pairs", *(f"{goal} [points]" for goal in GOALS), "more, less often retrieved"),
         *(f"actions until {goal}" for goal in GOALS),
+        *(f"until {goal}, never counted" for goal in GOALS),
     )
     return [
         Heading(f"Paired differences from {short[report.baseline]}"),
         Paragraph(
             f"Each variant less {report.baseline}, over the pairs of episodes that both have, ± one standard error; a "
             "scene's pairs are averaged first. Shares in percentage points; actions over the pairs in which both got "
-            "there."
+            "there, and then over all pairs, where never counts as below (restricted means)."
         ),
         Table.of(header, lines),
     ]
@@ -202,6 +203,43 @@ def _events(report: Report) -> list[Block]:
         explanation,
         table([events for events in report.events if events.objects is None]),
         dataclasses.replace(everything, folded="by number of objects", instead=instead),
+    ]
+
+
+def _actions(report: Report) -> list[Block]:
+    """Success over the number of actions, and the restricted means that are the areas above its curves."""
+    budget, retrieval = (horizon_of(goal, report.restricted[0].budget) for goal in ("found", "retrieved"))
+
+    def table(means: Sequence[RestrictedMeans]) -> Table:
+        columns = [column.replace("_", " ") for column in means[0].group]
+        lines = [
+            (
+                *map(report.key.text, group.group.values()),
+                group.episodes,
+                *(_cell(getattr(group, goal), getattr(group, f"{goal}_interval"), 2) for goal in GOALS),
+            )
+            for group in means
+        ]
+        return Table.of((*columns, "episodes", *(f"until {goal}" for goal in GOALS)), lines, texts=len(columns))
+
+    everything = [table(report.restricted)]
+    if _many(report) and list(report.restricted[0].group) == [VARIANT, "objects"]:
+        whole = table([group for group in report.restricted if group.objects is None])
+        folded = dataclasses.replace(
+            everything[0], folded="by number of objects", instead="By number of objects too: see actions.csv."
+        )
+        everything = [whole, folded]
+    return [
+        Heading("Success over the number of actions"),
+        Picture("success.png", "Success over the number of actions"),
+        Paragraph(
+            f"Restricted mean numbers of actions until then, over all episodes: one that never gets there counts as "
+            f"{budget}, and until *retrieved*, where the retrieval is an action too, as {retrieval}, whether it failed "
+            "before or its actions were used up. They are the areas above the curves, with a 95% interval from drawing "
+            "scenes again. An episode whose target is retrieved by a grasp that touches something, without having been "
+            "*graspable*, is never graspable."
+        ),
+        *everything,
     ]
 
 

@@ -136,10 +136,30 @@ def mean_intervals(
     return intervals
 
 
+def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -> Interval | None:
+    """The interval of a ratio of two means over the same scenes: percentile bootstrap, by SciPy, that draws scenes.
+
+    Args:
+      numerators, denominators: the two values of each scene.
+
+    Returns:
+      Low and high; None below two scenes, or where the mean of the denominators may be 0 by its own interval: any ratio
+      is possible then.
+    """
+    pairs = np.array(sorted(zip(numerators, denominators, strict=True)), float).reshape(-1, 2).T
+    below = mean_interval(denominators, range(len(denominators)))
+    if below is None or below[0] <= 0.0 <= below[1]:
+        return None
+    return _drawn_intervals([(pairs[0], pairs[1])])[0]
+
+
 def _drawn_intervals(
     pairs: Sequence[tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]],
 ) -> list[Interval]:
-    """The intervals of samples of the same number of scenes, from the sums and numbers of the scenes' values."""
+    """The intervals of samples of the same number of scenes, from the sums and numbers of the scenes' values.
+
+    Each is of the sum of the first over the sum of the second.
+    """
     interval = scipy.stats.bootstrap(
         tuple(np.stack(parts) for parts in zip(*pairs, strict=True)),
         lambda sums, counts, axis: np.sum(sums, axis) / np.sum(counts, axis),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 import numpy as np
 import scipy.stats
 
+from mechsearch_jax.benchmarks.statistics.actions_until import budget_of, restricted_steps
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, by_scene, mean_interval
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, scene_of, step_of
 from mechsearch_jax.benchmarks.statistics.variants import canonical, column, label_variants, natural
@@ -19,6 +20,8 @@ from mechsearch_jax.runtime.errors import InputError
 
 # What two episodes of a pair have in common by default.
 PAIRED = ("scenario", "seed")
+# How names of means end, of actions until a goal.
+STEPS, RESTRICTED = "_steps", "_restricted_steps"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +97,8 @@ def steps_change(pairs: Sequence[tuple[Row, Row]], goal: str) -> PairedDifferenc
     return change_of(pairs, lambda row: step_of(row, goal))
 
 
-# By variant, and by goal or goal and "_steps": the actions until then, over the pairs in which both got there.
+# By variant, and by goal; by goal and `STEPS`, the actions until then, over the pairs in which both got there; and by
+# goal and `RESTRICTED`, the same over all pairs: see `actions_until`.
 VariantDifferences = Mapping[str, Mapping[str, PairedDifference]]
 
 
@@ -124,16 +128,19 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
         raise InputError(f"report: no other variant shares {', '.join(names)} with the baseline {baseline}")
     # The places of the scenario's name and content in a pair; without them each pair is a scene.
     places = [names.index("scenario"), -1] if "scenario" in names else range(len(names))
-    goals = (*GOALS, *(f"{goal}_steps" for goal in GOALS))
-    base_means = {goal: {pair: _mean(episodes, goal) for pair, episodes in base.items()} for goal in goals}
+    budget = budget_of(rows)
+    names_of_means = [f"{goal}{ending}" for ending in ("", STEPS, RESTRICTED) for goal in GOALS]
+    base_means = {
+        name: {pair: _mean(episodes, name, budget) for pair, episodes in base.items()} for name in names_of_means
+    }
     differences: dict[str, dict[str, PairedDifference]] = {}
     for label in sorted(variants, key=natural):
         scenes = [tuple(pair[i] for i in places) for pair in common[label]]
         differences[label] = {
-            goal: _change(
-                [(_mean(variants[label][pair], goal), base_means[goal][pair]) for pair in common[label]], scenes
+            name: _change(
+                [(_mean(variants[label][pair], name, budget), base_means[name][pair]) for pair in common[label]], scenes
             )
-            for goal in goals
+            for name in names_of_means
         }
     return differences
 
@@ -150,9 +157,13 @@ def _change(
     return PairedDifference.of([value for value, _ in differences], [scene for _, scene in differences])
 
 
-def _mean(rows: Sequence[Row], goal: str) -> float | None:
-    """The share of rows that reached a goal, or the mean number of actions until then; None where none did."""
-    steps = [step for row in rows if (step := step_of(row, goal.removesuffix("_steps"))) is not None]
-    if goal in GOALS:
+def _mean(rows: Sequence[Row], name: str, budget: int) -> float | None:
+    """A mean over rows by its name, as `VariantDifferences` has it; None where there is nothing to average."""
+    goal = name.removesuffix(RESTRICTED).removesuffix(STEPS)
+    if name.endswith(RESTRICTED):
+        steps = [step for row in rows if (step := restricted_steps(row, goal, budget)) is not None]
+    else:
+        steps = [step for row in rows if (step := step_of(row, goal)) is not None]
+    if name == goal:
         return len(steps) / len(rows)
     return sum(steps) / len(steps) if steps else None

@@ -141,7 +141,7 @@ def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")
     Raises:
       InputError: there is no such column.
     """
-    groups = list(_groups(rows, columns))
+    groups = list(with_totals(rows, columns))
     intervals = mean_intervals(_steps_and_scenes(members, goal) for _, members in groups for goal in GOALS)
     return [
         _rates(group, members, intervals[place : place + len(GOALS)])
@@ -192,7 +192,7 @@ def _goal(rows: Sequence[Row], scenes: Sequence[Hashable], goal: str) -> dict[st
 def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Events]:
     """What happened on the way, grouped as `summarise` does; groups of which nothing is known are left out."""
     summary = []
-    for group, members in _groups(rows, columns):
+    for group, members in with_totals(rows, columns):
         recorded = [row for row in members if row.looks is not None]
         if not recorded:
             continue
@@ -216,7 +216,7 @@ def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "ob
     return summary
 
 
-def _groups(rows: Sequence[Row], columns: Sequence[str]) -> Iterator[tuple[Mapping[str, Hashable], list[Row]]]:
+def with_totals(rows: Sequence[Row], columns: Sequence[str]) -> Iterator[tuple[Mapping[str, Hashable], list[Row]]]:
     """The rows by columns, and after those that differ in the last one alone, with None for it, all of them."""
     names = [canonical(name) for name in columns]
     groups = grouped(rows, names)

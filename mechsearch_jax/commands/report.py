@@ -40,7 +40,9 @@ def report(
 ) -> None:
     """Print rates by variant and number of objects from results of evaluate or sweep, and write them with plots.
 
-    It also says what happened on the way: the truth ruled out, objects fallen, the arm held up, bodies never at rest.
+    It also says how many actions it took until found, graspable and retrieved, where an episode that never got there
+    counts as its budget, and what happened on the way: the truth ruled out, objects fallen, the arm held up, bodies
+    never at rest.
     Columns are those of the results: fields of rows, options, and "method" for the variant.
 
     Args:
@@ -83,10 +85,17 @@ def report(
 
 
 def _print(console: Console, report: Report, columns_chosen: bool) -> None:
-    """Print the report's rates, curve, differences and, unless columns were chosen, events."""
-    from mechsearch_jax.benchmarks.report.episode_tables import differences_table, events_summary_table, print_summary
+    """Print rates, restricted means of actions, the curve, differences and, unless columns were chosen, events."""
+    from mechsearch_jax.benchmarks.report.episode_tables import (
+        differences_table,
+        events_summary_table,
+        print_summary,
+        restricted_table,
+    )
 
     print_summary(console, report.rates, report.key)
+    console.print()
+    console.print(restricted_table(report.restricted, report.key))
     if report.curve:
         console.print()
         print_summary(console, report.curve, dataclasses.replace(report.key, common=""))

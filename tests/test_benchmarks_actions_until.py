@@ -1,0 +1,211 @@
+"""Actions until a goal: what is counted by hand, what SciPy says of the same times, and the share of a gap."""
+
+import csv
+import dataclasses
+import functools
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+import scipy.stats
+from rich.console import Console
+from stored_rows import row_of
+
+from mechsearch_jax.benchmarks.report import report_bench
+from mechsearch_jax.benchmarks.report.episode_tables import restricted_table
+from mechsearch_jax.benchmarks.report.report import Report
+from mechsearch_jax.benchmarks.report.report_figures import success_figure
+from mechsearch_jax.benchmarks.report.report_files import write_report
+from mechsearch_jax.benchmarks.statistics.actions_until import (
+    budget_of,
+    horizon_of,
+    reached,
+    restricted_means,
+    restricted_steps,
+)
+from mechsearch_jax.benchmarks.statistics.closed_gap import closed_gap
+from mechsearch_jax.benchmarks.statistics.intervals import ratio_interval
+from mechsearch_jax.benchmarks.statistics.paired import paired
+from mechsearch_jax.benchmarks.statistics.rates import GOALS
+from mechsearch_jax.benchmarks.statistics.variants import label_variants
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.planner import PRESETS
+
+LOST = {"retrieved": False, "graspable_step": None, "steps": 10, "failure": "found, but not graspable"}
+# On four scenes: retrieved after 3 actions; found, and its budget spent; tipped at the first action; an error.
+ROWS = [
+    row_of("c2-2-000"),
+    row_of("c2-2-001", **{**LOST, "found_step": 4}),
+    row_of("c2-8-000", **{**LOST, "found_step": None, "steps": 1, "failure": "the target fell over at action 1"}),
+    row_of("c2-8-001", **{**LOST, "found_step": None, "steps": 0, "failure": "error: x"}),
+]
+FOUND = functools.partial(restricted_steps, goal="found", budget=10)
+TWENTY = Method(config=PRESETS["standard"](max_steps=20))
+
+
+def test_an_episode_that_fails_never_gets_there_however_early_it_ends():
+    assert [restricted_steps(row, "found", 10) for row in ROWS] == [1, 4, 10, 10]
+    assert [restricted_steps(row, "graspable", 10) for row in ROWS] == [2, 10, 10, 10]
+    assert [restricted_steps(row, "retrieved", 10) for row in ROWS] == [3, 11, 11, 11]
+
+
+def test_the_retrieval_is_an_action_after_those_of_the_budget():
+    last = row_of("c2-2-002", found_step=10, graspable_step=10, steps=11)
+    never = dataclasses.replace(last, retrieved=False, failure="the arm was held up")
+    assert horizon_of("found", 10) == horizon_of("graspable", 10) == 10
+    assert [restricted_steps(row, "retrieved", 10) for row in (last, never)] == [11, 11]
+    assert reached([last, never], "retrieved", 11) == [0] * 11 + [1]
+    assert reached([last, never], "found", 10) == [0] * 10 + [2]
+
+
+def test_means_are_counted_by_hand():
+    everything = restricted_means(ROWS, ["objects"])[-1]
+    assert (everything.episodes, everything.budget, everything.objects) == (4, 10, None)
+    assert (everything.found, everything.graspable, everything.retrieved) == (25 / 4, 32 / 4, 36 / 4)
+    two, eight = restricted_means(ROWS, ["objects"])[:2]
+    assert (two.found, two.retrieved, eight.found, eight.retrieved) == (2.5, 7.0, 10.0, 11.0)
+    # With two scenes all draws are those of one, of both, or of the other.
+    assert (two.found_interval, eight.found_interval) == ((1.0, 4.0), (10.0, 10.0))
+
+
+def test_episodes_with_another_budget_are_counted_up_to_the_smaller_one():
+    late = row_of("c2-2-003", TWENTY, found_step=13, graspable_step=None, steps=15)
+    assert (budget_of([late]), budget_of([late, *ROWS]), budget_of(ROWS)) == (20, 10, 10)
+    assert [restricted_steps(late, goal, 20) for goal in GOALS] == [13, 20, 15]
+    assert [restricted_steps(late, goal, 10) for goal in GOALS] == [10, 10, 11]
+    early = dataclasses.replace(ROWS[0], configuration="{}")
+    assert budget_of([early, late]) == 10
+
+
+def test_where_nothing_is_taken_out_there_is_no_time_of_it():
+    row = row_of("c2-2-000", Method(protocol="published-code", engine="NativeSimulator"))
+    assert restricted_steps(row, "retrieved", 10) is None
+    (mean, _) = restricted_means([row], ["seed"])
+    assert (mean.retrieved, mean.retrieved_interval, mean.found) == (None, None, 1.0)
+
+
+def test_the_mean_is_the_area_above_the_curve_as_scipy_draws_it():
+    """Failures and the spent budget are censored at the horizon, not where they happened."""
+    rows = [row for row in report_bench.drawn_rows(96 * 4 * 40) if row.gamma == 0.9 and row.horizon == 3]
+    assert 0.1 < np.mean([not row.retrieved for row in rows]) < 0.9
+    mean = restricted_means(rows, ["target"])[0]
+    for goal in GOALS:
+        horizon = horizon_of(goal, 10)
+        steps = [restricted_steps(row, goal, 10) for row in rows]
+        counts = reached(rows, goal, horizon)
+        never = len(rows) - counts[-1]
+        data = scipy.stats.CensoredData(
+            uncensored=[step for step in steps if step < horizon],
+            right=[float(horizon)] * (never + counts[-1] - counts[-2]),
+        )
+        curve = scipy.stats.ecdf(data).sf
+        area = float(np.sum(curve.evaluate(np.arange(horizon, dtype=float))))
+        assert getattr(mean, goal) == pytest.approx(area, abs=1e-12)
+        assert getattr(mean, goal) == pytest.approx(sum(1 - count / len(rows) for count in counts[:-1]), abs=1e-12)
+        # Kaplan and Meier's estimate, with failures censored where they happened, would be lower.
+        ended = [min(row.steps, horizon) for row in rows]
+        failed = scipy.stats.CensoredData(
+            uncensored=[step for step in steps if step < horizon],
+            right=[float(end) for step, end in zip(steps, ended, strict=True) if step == horizon],
+        )
+        assert float(np.sum(scipy.stats.ecdf(failed).sf.evaluate(np.arange(horizon, dtype=float)))) <= area + 1e-12
+
+
+def test_intervals_draw_scenes_and_not_episodes():
+    """Four seeds of a scene that end alike say no more than one."""
+    once = [row_of(f"c2-2-{i:03d}", found_step=i % 7) for i in range(40)]
+    again = [dataclasses.replace(row, seed=seed) for row in once for seed in range(4)]
+    (first, _), (second, _) = (restricted_means(rows, ["objects"]) for rows in (once, again))
+    assert first.found_interval == pytest.approx(second.found_interval)
+    rng, values = np.random.default_rng(1), np.array([i % 7 for i in range(40)], float)
+    drawn = values[rng.integers(0, 40, (20_000, 40))].mean(axis=1)
+    assert first.found_interval == pytest.approx(np.quantile(drawn, [0.025, 0.975]), abs=0.05)
+
+
+def times(name, steps, policy="greedy"):
+    """Rows that are found after so many actions, on a scene each; never where that is None."""
+    method = Method(policy)
+    return [
+        row_of(f"c2-2-{i:03d}", method, found_step=step, **(LOST if step is None else {}))
+        for i, step in enumerate(steps)
+    ]
+
+
+def test_a_gap_is_closed_by_a_share():
+    worse, ours, better = times("r", [8, None, 6]), times("p", [4, 7, 6, 1]), times("b", [0, 0, 2])
+    gap = closed_gap(ours, worse, better, FOUND)
+    # 24, 17 and 2 actions on the three scenes that all have.
+    assert (gap.share, gap.pairs) == (7 / 22, 3)
+    assert closed_gap(worse, worse, better, FOUND).share == 0.0
+    assert closed_gap(better, worse, better, FOUND).share == 1.0
+    # Worse than the worse one: below 0.
+    assert closed_gap(times("p", [9, 10, 9]), worse, better, FOUND).share == -4 / 22
+    assert closed_gap(ours[3:], worse, better, FOUND) == dataclasses.replace(gap, share=None, interval=None, pairs=0)
+    assert closed_gap(ours, worse, worse, FOUND).share is None
+
+
+def test_the_share_of_a_gap_has_the_interval_of_drawn_scenes():
+    rng = np.random.default_rng(3)
+    steps = [rng.integers(low, high, 60) for low, high in ((0, 6), (3, 11), (0, 3))]
+    ours, worse, better = (times("x", each.tolist()) for each in steps)
+    gap = closed_gap(ours, worse, better, FOUND)
+    p, r, b = (np.array(each, float) for each in steps)
+    drawn = rng.integers(0, 60, (20_000, 60))
+    ratios = (r - p)[drawn].sum(axis=1) / (r - b)[drawn].sum(axis=1)
+    assert gap.share == pytest.approx((r - p).sum() / (r - b).sum(), abs=1e-12)
+    assert gap.interval == pytest.approx(np.quantile(ratios, [0.025, 0.975]), abs=0.02)
+
+
+def test_a_ratio_to_what_may_be_nothing_has_no_interval():
+    assert ratio_interval([1.0, 2.0, 3.0], [-1.0, 1.0, 0.5]) is None
+    assert ratio_interval([1.0], [2.0]) is None
+    assert ratio_interval([1.0, 2.0, 3.0], [2.0, 4.0, 6.0]) == (0.5, 0.5)
+
+
+def test_the_interval_of_a_share_of_a_gap_holds_the_true_share():
+    """Scenes differ in how many actions the worse variant takes; 0.6 of the gap is closed on average."""
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(200):
+        gaps = rng.gamma(2.0, 2.0, 50)
+        saved = 0.6 * gaps + rng.normal(0.0, 1.5, 50)
+        low, high = ratio_interval(saved.tolist(), gaps.tolist())
+        held += low <= 0.6 <= high
+    assert 0.88 <= held / 200 <= 0.99
+
+
+def test_differences_count_pairs_that_never_got_there():
+    other = times("p", [2, None, 3], "random")
+    base = times("s", [1, 4, None])
+    label = label_variants([*base, *other])[0]
+    ((_, goals),) = paired([*base, *other], label).items()
+    assert (goals["found_steps"].pairs, goals["found_steps"].mean) == (1, 1.0)
+    assert (goals["found_restricted_steps"].pairs, goals["found_restricted_steps"].mean) == (3, (1 + 6 - 7) / 3)
+
+
+def test_a_report_has_the_means_in_its_page_its_table_and_on_the_screen(tmp_path):
+    report = Report.of([dataclasses.replace(row, looks=None) for row in ROWS])
+    write_report(report, tmp_path)
+    text = re.sub(" +", " ", (tmp_path / "report.md").read_text())
+    assert "one that never gets there counts as 10, and until *retrieved*" in text
+    assert "| search-for-grasp | 2 | 2 | 2.50 (1.00 to 4.00) | 6.00 (2.00 to 10.00) | 7.00 (3.00 to 11.00) |" in text
+    with open(tmp_path / "actions.csv", newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    assert (last["objects"], last["budget"], last["found"], last["retrieved"]) == ("all", "10", "6.25", "9.0")
+    assert float(last["found_low"]) < 6.25 < float(last["found_high"])
+    assert json.loads((tmp_path / "rates.json").read_text())["actions"][-1]["graspable"] == 8.0
+    screen = Console(file=io.StringIO(), width=100)
+    screen.print(restricted_table(report.restricted, report.key))
+    printed = screen.file.getvalue()
+    assert "never counted as 10, or 11 for retrieved" in printed
+    assert printed.splitlines()[-1].split()[1:] == ["all", "4", "6.2", "8.0", "9.0"]
+
+
+def test_the_curves_of_all_objects_are_drawn_beside_those_of_each_number():
+    figure = success_figure(ROWS)
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:3] == ["2 objects", "8 objects", "all"]
+    (line,) = figure.axes[2].get_lines()
+    assert line.get_ydata().tolist()[:5] == [0.0, 0.25, 0.25, 0.25, 0.5]
+    assert [axes.get_title() for axes in success_figure(ROWS[:2]).axes] == ["2 objects", "", ""]
