@@ -198,7 +198,7 @@ def test_a_report_has_the_means_in_its_page_its_table_and_on_the_screen(tmp_path
     screen = Console(file=io.StringIO(), width=100)
     screen.print(restricted_table(report.restricted, report.key))
     printed = screen.file.getvalue()
-    assert "never counted as 10, or 11 for retrieved" in printed
+    assert "never counted as 10, or 11 for retrieved" in " ".join(printed.split())
     assert printed.splitlines()[-1].split()[1:] == ["all", "4", "6.2", "8.0", "9.0"]
 
 

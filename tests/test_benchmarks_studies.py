@@ -12,6 +12,7 @@ from mechsearch_jax.benchmarks.studies import page
 from mechsearch_jax.benchmarks.studies.comparison import compare, screen, sentence
 from mechsearch_jax.benchmarks.studies.declared import GROUPS, STUDIES
 from mechsearch_jax.benchmarks.studies.pictures import picture
+from mechsearch_jax.benchmarks.studies.shown import shown, shown_study, source
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant, find_studies
 from mechsearch_jax.commands import study as command
 from mechsearch_jax.commands.main import parse
@@ -140,8 +141,26 @@ def test_of_runs_with_as_many_variants_the_newest_is_shown():
     rows = rows_of(STUDY.baseline, 1.0)
     days = {"a": "2026-11-24", "b": "2026-11-26", "c": "2026-11-25"}
     runs = [run_of(name, rows, command="x", started=day) for name, day in days.items()]
-    assert page.shown_run(STUDY, runs).name == "b"
-    assert page.shown_run(STUDY, []) is None
+    assert list(shown_study(STUDY, runs).labels) == ["b"]
+    assert shown_study(STUDY, []) is None
+    other = run_of("d", rows_of(STUDY.variants[1], 1.0), command="x", started="2026-11-27")
+    assert shown_study(STUDY, [other]) is None
+
+
+def test_a_variant_that_a_run_lacks_comes_from_another_one_of_the_same_simulator():
+    base, other = STUDY.variants
+    first = run_of("a", rows_of(base, 1.0), command="x", started="2026-11-25")
+    later = run_of("b", [*rows_of(base, 0.0), *rows_of(other, 0.5)][:60], command="x", started="2026-11-26")
+    alone = run_of("c", rows_of(other, 0.0), command="x", started="2026-11-27")
+    native = run_of("d", rows_of(other, 0.0, engine="NativeSimulator"), command="x", started="2026-11-28")
+    both = shown_study(STUDY, [alone, first, native])
+    assert both.labels == {"a": ["0.9"], "c": ["0.5"]}
+    assert [each.means["retrieved"] for each in both.comparisons] == [1.0, 0.0]
+    assert both.comparisons[1].changes["retrieved"].mean == -1.0
+    assert "runs/a.jsonl); from [c](../benchmarks/results/runs/c.jsonl): 0.5." in source(both)
+    # The run that has both goes first, and nothing is taken from the others.
+    assert shown_study(STUDY, [alone, first, later]).labels == {"b": ["0.9", "0.5"]}
+    assert shown_study(STUDY, [first, native]).labels == {"a": ["0.9"]}
 
 
 def test_without_partners_the_sentence_says_whose_rows_lack():
@@ -168,13 +187,13 @@ def test_the_page_shows_the_run_that_has_most_of_a_study_and_says_what_is_not_th
     gamma = STUDIES["gamma"]
     old = run_of("old", rows_of(gamma.variants[0], 1.0), command="x")
     new = run_of("new", [row for variant in gamma.variants[:3] for row in rows_of(variant, 0.8)], command="x")
-    text = page.page(page.shown([old, new]))
+    text = page.page(shown([old, new]))
     assert "[new](../benchmarks/results/runs/new.jsonl)" in text
     assert "runs/old.jsonl" not in text
     assert "Not run: gamma 0.7, gamma 0.8, gamma 1." in text
     assert text.count("| `mechsearch study ") == len(STUDIES) - 1
     assert "scenes that settings were chosen on" in text
-    assert set(page.shown([old, new])) == {"gamma"}
+    assert set(shown([old, new])) == {"gamma"}
 
 
 @pytest.mark.parametrize("name", ["gamma", "actions", "baselines"])

@@ -18,6 +18,9 @@ from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_
 from mechsearch_jax.benchmarks.store import runs
 from mechsearch_jax.benchmarks.store.runs import load_run
 from mechsearch_jax.benchmarks.studies import page as studies_page
+from mechsearch_jax.benchmarks.studies import yardstick_page
+from mechsearch_jax.benchmarks.studies.shown import shown
+from mechsearch_jax.benchmarks.studies.yardstick import YARDSTICK, measure
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.envs.world.mismatch import ASSUMED, MISMATCH_OPTIONS
 from mechsearch_jax.planner import OPTIONS, PRESETS
@@ -167,9 +170,12 @@ def test_the_results_page_is_what_its_stored_results_say():
 
 
 def test_the_page_of_studies_is_what_its_stored_runs_say():
-    shown = studies_page.shown(runs.stored_runs(RESULTS / "runs"))
-    assert read("docs/studies.md") == studies_page.page(shown), f"run `python -m {studies_page.__name__}`"
-    assert {file.stem for file in (ROOT / "docs/studies").iterdir()} == set(shown)
+    compared = shown(runs.stored_runs(RESULTS / "runs"))
+    assert read("docs/studies.md") == studies_page.page(compared), f"run `python -m {studies_page.__name__}`"
+    assert {file.stem for file in (ROOT / "docs/studies").iterdir()} == set(compared)
+    measured = measure(compared[YARDSTICK.study])
+    assert read("docs/yardstick.md") == yardstick_page.page(measured), f"run `python -m {studies_page.__name__}`"
+    assert {file.stem for file in (ROOT / "docs/yardstick").iterdir()} == set(yardstick_page.pictures(measured))
 
 
 def test_every_stored_result_is_linked_from_a_guide():

@@ -105,16 +105,16 @@ def sentence(study: Study, comparisons: Sequence[Comparison]) -> str:
         by_verdict[verdict(change)].append(shown if verdict(change) else each.variant.label)
     parts = []
     if by_verdict[-1]:
-        parts.append(f"fewer are retrieved with {_listed(by_verdict[-1])}")
+        parts.append(f"fewer are retrieved with {listed(by_verdict[-1])}")
     if by_verdict[1]:
-        parts.append(f"more are retrieved with {_listed(by_verdict[1])}")
+        parts.append(f"more are retrieved with {listed(by_verdict[1])}")
     if by_verdict[0]:
-        parts.append(f"no difference is certain with {_listed(by_verdict[0])}")
+        parts.append(f"no difference is certain with {listed(by_verdict[0])}")
     text = "; ".join(parts)
     return f"Against {study.baseline.label}, in points of retrieved: {text}."
 
 
-def _listed(parts: Sequence[str]) -> str:
+def listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 

@@ -1,6 +1,7 @@
-"""Writes docs/studies.md and its pictures from the stored runs: `python -m mechsearch_jax.benchmarks.studies.page`.
+"""Writes docs/studies.md, docs/yardstick.md and their pictures: `python -m mechsearch_jax.benchmarks.studies.page`.
 
-Start it in a checkout. A study is shown from the stored run that has most of its variants.
+Start it in a checkout. A study is shown from the stored run that has most of its variants, and what that run lacks from
+the others.
 """
 
 from __future__ import annotations
@@ -9,13 +10,17 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Paragraph, Picture, Table, as_markdown
-from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
-from mechsearch_jax.benchmarks.studies.comparison import HEADER, Comparison, cells, compare, sentence
-from mechsearch_jax.benchmarks.studies.declared import GROUPS, STUDIES
+from mechsearch_jax.benchmarks.store.runs import RUNS, stored_runs
+from mechsearch_jax.benchmarks.studies import yardstick_page
+from mechsearch_jax.benchmarks.studies.comparison import HEADER, cells, sentence
+from mechsearch_jax.benchmarks.studies.declared import GROUPS
 from mechsearch_jax.benchmarks.studies.pictures import picture
+from mechsearch_jax.benchmarks.studies.shown import ShownStudy, shown, source
 from mechsearch_jax.benchmarks.studies.studies import Study
-from mechsearch_jax.envs.scenes.scene_sets import find_set, is_chosen_on
+from mechsearch_jax.benchmarks.studies.yardstick import YARDSTICK, measure
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import replacing
 
@@ -33,25 +38,18 @@ INTRODUCTION = (
 )
 
 
-def shown_run(study: Study, runs: Sequence[StoredRun]) -> StoredRun | None:
-    """The run that has most of a study's variants, the first among them; the newest of several; None without one."""
-    counts = [
-        (len(groups), str(run.lines[0].get("started") or ""), i)
-        for i, run in enumerate(runs)
-        if study.baseline.label in (groups := study.rows_of(run.rows))
-    ]
-    return runs[max(counts)[-1]] if counts else None
-
-
-def blocks(study: Study, run: StoredRun, comparisons: Sequence[Comparison]) -> list[Block]:
-    """What the page says of a study of which a run has rows."""
+def blocks(shown_study: ShownStudy) -> list[Block]:
+    """What the page says of a study of which there are rows."""
+    study, comparisons = shown_study.study, shown_study.comparisons
+    link = f"How many actions each takes, and how far that is from the fewest: [yardstick]({yardstick_page.PAGE})."
     return [
         Heading(study.name, 3),
         Paragraph(f"**{study.question}**"),
         Paragraph(sentence(study, comparisons)),
         Picture(f"studies/{study.name}.png", study.question),
         Table.of(HEADER, list(map(cells, comparisons))),
-        Paragraph(_source(study, run, comparisons)),
+        Paragraph(source(shown_study)),
+        *([Paragraph(link)] if study.name == YARDSTICK.study else []),
     ]
 
 
@@ -63,47 +61,26 @@ def not_run(studies: Sequence[Study]) -> list[Block]:
     return [Paragraph("Declared, and not run yet:"), Table.of(("study", "question", "scene set"), questions, texts=3)]
 
 
-def _source(study: Study, run: StoredRun, comparisons: Sequence[Comparison]) -> str:
-    rows = [row for group in study.rows_of(run.rows).values() for row in group]
-    seeds = sorted({row.seed for row in rows})
-    first = find_set(study.scenes).blocks[0].scene_name(0)
-    ran, declared = len({row.scenario for row in rows}), find_set(study.scenes).scenes
-    part = f"{ran:,} of the {declared:,} scenes of " if ran < declared else ""
-    which = "settings were chosen on" if is_chosen_on(first) else "nothing was chosen on"
-    missing = [v.label for v in study.variants if v.label not in {c.variant.label for c in comparisons}]
-    lacks = f" Not run: {', '.join(missing)}." if missing else ""
-    devices = ", ".join(sorted({row.device or "unknown" for row in rows}))
-    with_seeds = f"seed{'s' if seeds[1:] else ''} {', '.join(map(str, seeds))}"
-    return (
-        f"`mechsearch study {study.name}` with {with_seeds}; {part}`{study.scenes}`, scenes that "
-        f"{which}; {devices}; {', '.join(sorted({row.code for row in rows}))}; its command stands in "
-        f"[{run.name}](../benchmarks/results/runs/{run.name}.jsonl).{lacks}"
-    )
-
-
-def shown(runs: Sequence[StoredRun]) -> Mapping[str, tuple[StoredRun, Sequence[Comparison]]]:
-    """The studies that there is something to compare of, by name: the run, and what comes of its variants."""
-    picked = {name: shown_run(study, runs) for name, study in STUDIES.items()}
-    compared = {name: (run, compare(STUDIES[name], run.rows)) for name, run in picked.items() if run is not None}
-    return {name: (run, comparisons) for name, (run, comparisons) in compared.items() if len(comparisons) > 1}
-
-
-def page(compared: Mapping[str, tuple[StoredRun, Sequence[Comparison]]]) -> str:
+def page(compared: Mapping[str, ShownStudy]) -> str:
     """The page in Markdown, of what `shown` found."""
     parts: list[Block] = [Heading("Studies: ablations, baselines, robustness", 1), *map(Paragraph, INTRODUCTION)]
     for group, studies in GROUPS.items():
         parts.append(Heading(group))
         for study in studies:
-            parts += blocks(study, *compared[study.name]) if study.name in compared else []
+            parts += blocks(compared[study.name]) if study.name in compared else []
         parts += not_run([study for study in studies if study.name not in compared])
     return as_markdown(parts)
 
 
 def main() -> None:
-    """Rewrite the page and its pictures."""
-    parser = argparse.ArgumentParser(description="Write docs/studies.md and its pictures from the stored runs.")
+    """Rewrite the pages and their pictures."""
+    parser = argparse.ArgumentParser(
+        description="Write docs/studies.md, docs/yardstick.md and their pictures from the stored runs."
+    )
     parser.add_argument("--runs", default=RUNS, type=Path, help="folder of the stored runs")
-    parser.add_argument("--out", default="docs/studies.md", type=Path, help="the page; its pictures come beside it")
+    parser.add_argument(
+        "--out", default="docs/studies.md", type=Path, help="the page; the other one and all pictures come beside it"
+    )
     arguments = parser.parse_args()
     try:
         if not arguments.runs.is_dir():
@@ -111,14 +88,24 @@ def main() -> None:
         runs = stored_runs(arguments.runs)
     except InputError as error:
         parser.error(str(error))
-    folder = arguments.out.with_suffix("")
-    folder.mkdir(parents=True, exist_ok=True)
     compared = shown(runs)
-    for name, (_, comparisons) in compared.items():
+    figures = {name: picture(each.study, each.comparisons) for name, each in compared.items()}
+    _write(arguments.out, page(compared), figures)
+    if YARDSTICK.study in compared:
+        measured = measure(compared[YARDSTICK.study])
+        out = arguments.out.with_name(yardstick_page.PAGE)
+        _write(out, yardstick_page.page(measured), yardstick_page.pictures(measured))
+
+
+def _write(out: Path, text: str, figures: Mapping[str, Figure]) -> None:
+    """Write a page, and its pictures into the folder of its name."""
+    folder = out.with_suffix("")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
         with replacing(folder / f"{name}.png") as file:
-            picture(STUDIES[name], comparisons).savefig(file, format="png", dpi=110)
-    with replacing(arguments.out) as file:
-        file.write(page(compared).encode())
+            figure.savefig(file, format="png", dpi=110)
+    with replacing(out) as file:
+        file.write(text.encode())
 
 
 if __name__ == "__main__":
