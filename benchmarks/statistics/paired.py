@@ -6,6 +6,7 @@ The episodes of a scene are not independent. So a scene's differences are averag
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import numpy as np
@@ -61,7 +62,7 @@ class PairedDifference:
         """Of the mean, from how scenes differ, by SciPy; None below two scenes."""
         return float(scipy.stats.sem(self.scene_means)) if self.scenes > 1 else None
 
-    @property
+    @functools.cached_property
     def interval(self) -> Interval | None:
         """The 95% interval of the mean, from drawing scenes; None below two scenes."""
         return mean_interval(self.scene_means, range(self.scenes))

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from scipy.optimize import isotonic_regression
 
 from mechsearch_jax.viz.drawing import INK, MUTED
@@ -34,13 +35,13 @@ def curves_figure(curves: Mapping[str, Sequence[float]], order: Sequence[str], g
       order: all labels that there may be, at most as many as `STYLES`: a label has the style of its place.
       goal: name of the axis.
     """
-    figure = Figure(figsize=(7.6, 4.4), layout="constrained")
+    figure = Figure(figsize=(7.6, 4.4), layout=ConstrainedLayoutEngine(w_pad=0.1))
     axes = figure.subplots()
     styles = dict(zip(order, STYLES, strict=False))
     last = max(len(curve) for curve in curves.values()) - 1
-    labels = list(curves)
-    places = spread([curves[label][-1] for label in labels], LINE_HEIGHT, HIGHEST)
-    for label, place in zip(labels, places, strict=True):
+    # Where two end alike, the label of the larger area is the higher one.
+    ends = [curve[-1] + 1e-6 * sum(curve) for curve in curves.values()]
+    for label, place in zip(curves, spread(ends, LINE_HEIGHT, HIGHEST), strict=True):
         curve, style = curves[label], {"linewidth": 1.4, **styles[label]}
         axes.plot(range(len(curve)), curve, marker="o", markersize=3, label=label, **style)
         axes.annotate(
