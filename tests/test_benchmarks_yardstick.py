@@ -39,8 +39,8 @@ def rows_of(label, steps):
     return [row_of(scene, method, looks=None, **each) for scene, each in zip(scenes, fields, strict=True)]
 
 
-def shown_of(found):
-    rows = [row for label, steps in found.items() for row in rows_of(label, steps)]
+def shown_of(actions):
+    rows = [row for label, steps in actions.items() for row in rows_of(label, steps)]
     return shown_study(STUDY, [run_of("mine", rows, command="x")])
 
 
@@ -116,9 +116,9 @@ def test_without_the_informed_planner_the_page_says_so():
 
 def test_every_policy_has_a_curve_of_its_shares_with_a_label_that_can_be_read():
     rng = np.random.default_rng(0)
-    found = {label: rng.integers(0, 4 + i, 40).tolist() for i, label in enumerate(YARDSTICK.drawn)}
-    found["informed"] = [0] * 40
-    measured = measure(shown_of(found))
+    actions = {label: rng.integers(0, 4 + i, 40).tolist() for i, label in enumerate(YARDSTICK.drawn)}
+    actions["informed"] = [0] * 40
+    measured = measure(shown_of(actions))
     figures = yardstick_page.pictures(measured)
     assert set(figures) == set(yardstick_page.PLACED)
     for goal, figure in figures.items():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 
 from mechsearch_jax.benchmarks.statistics.actions_until import budget_of, horizon_of, reached, restricted_steps
@@ -111,21 +112,27 @@ def measure(shown: ShownStudy, yardstick: Yardstick = YARDSTICK) -> Measured:
     rows = {label: members for label, members in common.items() if members}
     budget, objects = budget_of(shown.rows), sorted({row.objects for row in rows[base]})
     actions: dict[tuple[str, str, int | None], ActionsUntil] = {}
-    for count in (None, *objects):
-        part = {label: [row for row in members if count in (None, row.objects)] for label, members in rows.items()}
-        for goal in GOALS:
-            for label in filter(part.get, part):
-                actions[goal, label, count] = _actions_until(part, base, label, goal, budget, yardstick)
+    for count, goal in itertools.product((None, *objects), GOALS):
+        part = {
+            label: [
+                row
+                for row in members
+                if count in (None, row.objects) and restricted_steps(row, goal, budget) is not None
+            ]
+            for label, members in rows.items()
+        }
+        for label in filter(part.get, part):
+            actions[goal, label, count] = _actions_until(part, base, label, goal, budget, yardstick)
     return Measured(shown, budget, objects, rows, actions)
 
 
 def _actions_until(
     rows: Mapping[str, Sequence[Row]], base: str, label: str, goal: str, budget: int, yardstick: Yardstick
 ) -> ActionsUntil:
-    steps_of = functools.partial(restricted_steps, goal=goal, budget=budget)
-    members = [row for row in rows[label] if steps_of(row) is not None]
-    scenes, steps = list(map(scene_of, members)), [steps for row in members if (steps := steps_of(row)) is not None]
-    horizon = horizon_of(goal, budget)
+    """The actions of a variant until a goal, of at least one row, all of which have the goal."""
+    steps_of, horizon = functools.partial(restricted_steps, goal=goal, budget=budget), horizon_of(goal, budget)
+    members, scenes = rows[label], list(map(scene_of, rows[label]))
+    steps = [steps for row in members if (steps := steps_of(row)) is not None]
     within = [(step := step_of(row, goal)) is not None and step <= horizon for row in members]
     worse, better = (rows.get(end, ()) for end in (yardstick.worse, yardstick.better))
     between = label not in (yardstick.worse, yardstick.better) and bool(worse and better)
@@ -135,6 +142,6 @@ def _actions_until(
         share_interval=share_interval(within, scenes),
         mean=sum(steps) / len(steps),
         interval=mean_interval(steps, scenes),
-        change=change_of(same_episodes(members, rows[base]), steps_of) if label != base else None,
+        change=change_of(same_episodes(members, rows.get(base, ())), steps_of) if label != base else None,
         gap=closed_gap(members, worse, better, steps_of) if between else None,
     )
