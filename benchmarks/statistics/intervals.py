@@ -150,7 +150,9 @@ def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -
     below = mean_interval(denominators, range(len(denominators)))
     if below is None or below[0] <= 0.0 <= below[1]:
         return None
-    return _drawn_intervals([(pairs[0], pairs[1])])[0]
+    # A draw may have a denominator of 0: its ratio is infinite, beyond the percentiles, since few draws have one.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _drawn_intervals([(pairs[0], pairs[1])])[0]
 
 
 def _drawn_intervals(
