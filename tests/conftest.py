@@ -27,10 +27,10 @@ if "XLA_FLAGS" not in os.environ:
     tried = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=environment, capture_output=True)
     os.environ["XLA_FLAGS"] = QUICK if tried.returncode == 0 else ""
 
-import jaxtyping  # noqa: E402
+import runtime_checks  # noqa: E402
 
 # Has to happen before the package is imported, and so before everything else.
-jaxtyping.install_import_hook("mechsearch_jax", "runtime_checks.check")
+runtime_checks.install("mechsearch_jax")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
