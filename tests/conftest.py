@@ -46,6 +46,10 @@ GROUPS = {
     "planning": (
         "test_planner",
         "test_envs_default_episode",
+        "test_envs_trials",
+        "test_planner_lost_target",
+        "test_planner_unseen_motion",
+        "test_search",
         "test_planner_moved_target",
         "test_dynamics_actions",
         "test_envs_episode",
@@ -58,7 +62,12 @@ GROUPS = {
         "test_docs",
     ),
     "pushing": ("test_benchmarks_push", "test_envs_pushes"),
-    "recognising": ("test_envs_recognisers", "test_perception_recogniser", "test_benchmarks_recognition"),
+    "recognising": (
+        "test_envs_recognisers",
+        "test_perception_recogniser",
+        "test_shelf_as_data",
+        "test_benchmarks_recognition",
+    ),
 }
 LONG_FIRST = (
     *GROUPS["planning"],
