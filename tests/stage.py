@@ -124,22 +124,27 @@ class Stage:
 
 
 class Grab(flax.struct.PyTreeNode):
-    """A policy: takes the target out as soon as it can be, and else pushes the first object, by a random distance.
+    """A policy: takes the target out as soon as it can be, and else pushes an object, by a random distance.
 
     Attributes:
       charge: is added to the cost before the target is found.
+      nearest: 0 to push the first object, 1 the one that is nearest to the robot, whatever its number. It is data, so
+        that both are one program.
     """
 
     charge: float = 1.0
+    nearest: float = 0.0
 
     def __call__(self, key, problem, belief, observation):
-        grasp = best_grasp(problem.target_grasps, observation.objects, belief.found_pose, belief.found)
+        # As the tests of the planner call it, so that it is compiled once.
+        grasp = best_grasp(problem.target_grasps, observation.objects, belief.found_pose)
         able = belief.found & grasp.success
         distance = jax.random.uniform(key, minval=0.05, maxval=0.15)
+        x = jnp.where(observation.objects.valid, observation.objects.position[:, 0], jnp.inf)
         T = jnp.eye(4).at[:3, 3].set(jnp.array([0.5, 0.0, 0.5]))
         push = Action(
             kind=jnp.int32(ActionKind.PUSH),
-            object=jnp.int32(0),
+            object=jnp.where(self.nearest > 0, jnp.argmin(x), 0).astype(jnp.int32),
             T_world_gripper=T,
             displacement=jnp.array([0.0, 1.0, 0.0]) * distance,
             T_world_place=T.at[1, 3].add(distance),
@@ -165,6 +170,7 @@ class Grab(flax.struct.PyTreeNode):
 
 
 grab = Grab()
+grab_nearest = Grab(nearest=1.0)
 
 
 def idle(key, problem, belief, observation):
@@ -189,16 +195,3 @@ class Shuffled:
         seen = self.inner(key, snapshot)
         objects, confidence = jax.tree.map(lambda a: a[np.array(self.order)], (seen.objects, seen.confidence))
         return seen.replace(objects=objects, confidence=confidence)
-
-
-def grab_nearest(key, problem, belief, observation):
-    """`grab`, but the object that is nearest to the robot is pushed, whatever its number."""
-    x = jnp.where(observation.objects.valid, observation.objects.position[:, 0], jnp.inf)
-    decision = grab(key, problem, belief, observation)
-    pushes = decision.action.kind == ActionKind.PUSH
-    index = jnp.argmin(x).astype(jnp.int32)
-    actions = decision.sequences.actions
-    return decision.replace(
-        action=decision.action.replace(object=jnp.where(pushes, index, decision.action.object)),
-        sequences=decision.sequences.replace(actions=actions.replace(object=jnp.full((1, 1), index))),
-    )

@@ -214,23 +214,24 @@ def test_the_published_protocol_gives_the_pose_of_a_detected_target_only(problem
         np.testing.assert_allclose(pose, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("order", [(1, 2, 0, 3, 4, 5, 6, 7), (7, 6, 5, 4, 3, 2, 1, 0)])
-def test_objects_in_any_order_give_the_same_decisions_and_names_follow_the_bodies(problem, order):
+def test_objects_in_any_order_give_the_same_decisions_and_names_follow_the_bodies(problem):
     diaries, stages, records = [], [], []
-    for recogniser in (oracle, Shuffled(order)):
+    for recogniser in (oracle, Shuffled((1, 2, 0, 3, 4, 5, 6, 7)), Shuffled((7, 6, 5, 4, 3, 2, 1, 0))):
         diary, stage = Diary(), Stage()
         episode = run(problem, BLOCKED, stage, grab_nearest, diary, recogniser=recogniser)
         diaries.append(diary)
         stages.append(stage)
         records.append([dataclasses.replace(step, timings={}) for step in episode.steps])
-    assert records[0] == records[1]
     assert [step.action.object for step in records[0][:2]] == [0, 0]
-    assert [int(action.object) for action in stages[1].actions] == [int(action.object) for action in stages[0].actions]
-    for plain, shuffled in zip(*(diary.moments for diary in diaries), strict=True):
-        jax.tree.map(np.testing.assert_array_equal, plain.observation, shuffled.observation)
-        if plain.decision is not None:
-            jax.tree.map(np.testing.assert_array_equal, plain.decision, shuffled.decision)
-            assert frame(plain, problem).title == frame(shuffled, problem).title
+    moved = [[int(action.object) for action in stage.actions] for stage in stages]
+    for i in (1, 2):
+        assert records[i] == records[0]
+        assert moved[i] == moved[0]
+        for plain, shuffled in zip(diaries[0].moments, diaries[i].moments, strict=True):
+            jax.tree.map(np.testing.assert_array_equal, plain.observation, shuffled.observation)
+            if plain.decision is not None:
+                jax.tree.map(np.testing.assert_array_equal, plain.decision, shuffled.decision)
+                assert frame(plain, problem).title == frame(shuffled, problem).title
 
 
 def test_an_object_that_is_not_there_is_none_in_the_record(problem):
