@@ -79,8 +79,9 @@ def decision(problem, belief):
 @pytest.mark.parametrize(
     ("device", "target"),
     [
-        ("cpu", "hidden"),
+        # The largest.
         ("gpu", "found"),
+        pytest.param("cpu", "hidden", marks=pytest.mark.slow),
         pytest.param("cpu", "found", marks=pytest.mark.slow),
         pytest.param("gpu", "hidden", marks=pytest.mark.slow),
     ],
