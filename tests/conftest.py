@@ -118,9 +118,10 @@ def commit(folder=Path(__file__).parent):
     return done.stdout.strip()
 
 
-def part_of(nodeid, parts):
-    """To which of the parts, counted from 1, a slow test belongs."""
-    return zlib.crc32(nodeid.encode()) % parts + 1
+def part_of_each(nodeids, parts):
+    """To which of the parts, counted from 1, each slow test belongs: shuffled by name, and as many to each part."""
+    shuffled = sorted(nodeids, key=lambda nodeid: (zlib.crc32(nodeid.encode()), nodeid))
+    return {nodeid: i % parts + 1 for i, nodeid in enumerate(shuffled)}
 
 
 def pytest_configure(config):
@@ -149,12 +150,15 @@ def pytest_xdist_make_scheduler(config, log):
     return ByGroup(config, log)
 
 
+# Parts are made of the tests that `-m` has left.
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     if config.getoption("slow_share"):
         part, parts = share_of(config.getoption("slow_share"))
-        left_out = [i for i in items if i.get_closest_marker("slow") and part_of(i.nodeid, parts) != part]
+        part_of = part_of_each([item.nodeid for item in items if item.get_closest_marker("slow")], parts)
+        left_out = [item for item in items if part_of.get(item.nodeid, part) != part]
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in set(left_out)]
+        items[:] = [item for item in items if part_of.get(item.nodeid, part) == part]
     rank = {name: i for i, name in enumerate((*FIRST, *LONG_FIRST))}
     items.sort(key=lambda item: rank.get(Path(item.path).stem, len(rank)))
 
