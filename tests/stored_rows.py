@@ -22,7 +22,7 @@ def row_of(scene, method=USUAL, seed=0, **fields):
     """A row of an episode that found the target, and took it out."""
     usual = {
         "scenario": scene,
-        "objects": int(scene.split("-")[-2]),
+        "objects": int(scene.split("-")[-2]) if "objects" not in fields else None,
         "target": "cylinder",
         **columns_of(method),
         "seed": seed,
