@@ -264,6 +264,15 @@ class Bench:
         return fitted, bool(visible), time.perf_counter() - start
 
 
+def _outcome(centre: float | None, angle: float | None) -> str:
+    """What becomes of an object whose answer is so far off [m] and turned by so much [degrees]; None without one."""
+    if centre is None or angle is None:
+        return "missing"
+    if centre > OFF:
+        return "off"
+    return "turned" if angle > TURNED else "right"
+
+
 def judged(
     scenario: Scenario,
     picture: Picture,
@@ -299,13 +308,7 @@ def judged(
         answer = None if chosen[i] < 0 else int(answers[chosen[i]])
         centre = None if answer is None else float(distance[i, chosen[i]])
         angle = None if answer is None else turned_by(thing_of("", body), _answer(objects, answer))
-        outcome = "right"
-        if centre is None or angle is None:
-            outcome = "missing"
-        elif centre > OFF:
-            outcome = "off"
-        elif angle > TURNED:
-            outcome = "turned"
+        outcome = _outcome(centre, angle)
         rows.append(
             Row(
                 scene=scenario.name,
