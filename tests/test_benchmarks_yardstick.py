@@ -41,7 +41,7 @@ def rows_of(label, steps):
 
 def shown_of(actions):
     rows = [row for label, steps in actions.items() for row in rows_of(label, steps)]
-    return shown_study(STUDY, [run_of("mine", rows, command="x")])
+    return shown_study(STUDY, [run_of("user-run", rows, command="x")])
 
 
 def text_of(measured):
@@ -158,7 +158,7 @@ def test_one_command_writes_both_pages_and_their_pictures(tmp_path, monkeypatch)
     rows = [row for label, steps in FOUND.items() for row in rows_of(label, steps)]
     runs = tmp_path / "runs"
     runs.mkdir()
-    write_run(dataclasses.replace(run_of("mine", rows, command="x"), name="mine"), runs)
+    write_run(dataclasses.replace(run_of("user-run", rows, command="x"), name="user-run"), runs)
     monkeypatch.setattr(sys, "argv", ["page", "--runs", str(runs), "--out", str(tmp_path / "docs" / "studies.md")])
     (tmp_path / "docs").mkdir()
     studies_page.main()

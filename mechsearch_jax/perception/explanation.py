@@ -274,7 +274,7 @@ def _inside(scene: Superquadrics, body: Superquadrics) -> Bool[Array, " n"]:
 
     Args:
       scene: the objects.
-      body: the target, one slot; absent if it is not fitted_target.
+      body: the target, one slot; absent if it is not visible.
     """
     level = scene.position.at[:, 2].set(body.position[0, 2])
     return (surface_distance(body, level)[0] < 0.0) & body.valid[0]

@@ -21,7 +21,7 @@ from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Parts of a cloud in which the nearest point is sought, if they are of equal size.
+# Parts of a cloud in which the nearest point is searched for, if they are of equal size.
 _PARTS = 64
 
 

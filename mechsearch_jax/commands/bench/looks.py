@@ -29,7 +29,7 @@ def bench_looks(
     """Measure what comes of a depth and a colour image alone: which visible objects are missing, off or turned,
     phantoms, missed targets, and how often objects are wrong by their stated confidence.
 
-    MuJoCo renders the images, not the package's own camera. The target is red, the objects have random colors.
+    MuJoCo renders the images, not the package's own camera. The target is red, the objects have random colours.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
