@@ -80,7 +80,7 @@ def _along_axis(study: Study, comparisons: Sequence[Comparison]) -> Figure:
 
 def _changes(comparisons: Sequence[Comparison]) -> Figure:
     others = [c for c in comparisons if c.changes]
-    figure = Figure(figsize=(5.6, 0.9 + 0.27 * max(len(others), 1)), layout="constrained")
+    figure = Figure(figsize=(5.6, 1.1 + 0.27 * max(len(others), 1)), layout="constrained")
     axes = figure.subplots()
     axes.axvline(0.0, color=INK, linewidth=0.8)
     for offset, (name, colour) in zip((-0.13, 0.13), COLOURS.items(), strict=True):
@@ -91,9 +91,9 @@ def _changes(comparisons: Sequence[Comparison]) -> Figure:
         bars = _bars(means, intervals) if others else None
         axes.errorbar(means, y, xerr=bars, fmt="o", color=colour, markersize=4, capsize=2, linewidth=1.2, label=name)
     axes.set_yticks(np.arange(len(others)), [c.variant.label for c in others])
-    axes.invert_yaxis()
+    axes.set_ylim(max(len(others), 1) - 0.5, -0.5)
     axes.set_xlabel("change of the share of episodes, points", fontsize=9, color=INK)
-    axes.legend(frameon=False, fontsize=8)
+    figure.legend(frameon=False, fontsize=8, ncols=2, loc="outside upper right")
     _plain(axes)
     return figure
 
