@@ -1,7 +1,8 @@
 """Hooks of mkdocs.yml, by which the pages of this folder, written for the repository's web view, become a site.
 
 A page links files of the repository that lie outside of docs, such as stored results. On the site they lie under
-`files`, copied as they are; a folder becomes a list of what is in it; two pages from elsewhere become pages of the site.
+`files`, copied as they are, and a folder becomes a list of what is in it. Two pages from elsewhere become pages of the
+site.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ PLACES = {"README.md": "index.md", **ELSEWHERE}
 _TREE = tempfile.TemporaryDirectory()
 FOLDERS_OF_CODE = ("envs", "train", "benchmarks")
 _LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
+_CELL = re.compile(r"<t[dh].*?</t[dh]>", re.DOTALL)
+# Code without other tags in it; where a long name in it may be broken.
+_PLAIN = re.compile(r"(?<=<code>)[^<]*(?=</code>)")
+_BREAK = re.compile(r"([._/|])(?=[A-Za-z])")
+_INTERVAL = re.compile(r"\([-+]?[\d.]+ to [-+]?[\d.]+\)")
 _CODE = re.compile(r"(^```.*?^```$|`(?:[^`\n]|\n(?!\n))+`)", re.MULTILINE | re.DOTALL)
 
 
@@ -61,6 +67,19 @@ def on_page_markdown(markdown, page, config, files):
         return f"{match[1]}{relpath(uri, here)}{match[3]}"
 
     return "".join(part if part.startswith("`") else _LINK.sub(moved, part) for part in _CODE.split(markdown))
+
+
+def on_page_content(html, page, config, files):
+    """Show bars in the code of a table as the repository's web view does, and keep an interval in one line.
+
+    A long name in a table may be broken after its dots and underscores.
+    """
+
+    def code(match):
+        return _BREAK.sub(r"\1<wbr>", match[0].replace("\\|", "|"))
+
+    html = _CELL.sub(lambda cell: _PLAIN.sub(code, cell[0]), html)
+    return _INTERVAL.sub(lambda interval: interval[0].replace(" ", "&nbsp;"), html)
 
 
 def _in_repository(file, link):

@@ -96,6 +96,7 @@ def test_python_runs_as_it_stands(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("page", DONE)
 def test_what_a_page_tells_to_do_can_be_done(page, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

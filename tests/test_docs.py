@@ -130,6 +130,13 @@ def test_the_python_guide_names_all_of_the_front_door():
         assert re.search(rf"`(?:[^`]*\W)?{name}\b", guide), name
 
 
+def test_the_api_pages_hold_all_of_the_front_door():
+    pages = "\n".join(read(page) for page in PAGES if page.startswith("docs/api/"))
+    shown = re.findall(r"^::: mechsearch_jax\.([\w.]+)\.(\w+)$", pages, re.MULTILINE)
+    assert len(shown) == len(set(shown))
+    assert set(mechsearch_jax._ROOMS.items()) <= {(name, room) for room, name in shown}
+
+
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
     table = rows("docs/commands.md", "| option | what it sets | `standard` | `paper` |")
     stated = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
