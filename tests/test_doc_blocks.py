@@ -67,6 +67,18 @@ def test_commands_are_understood(page):
             assert program in OTHERS or (program == "python" and arguments[0] in OTHERS), (program, arguments)
 
 
+DRY = [words[1:] for page in PAGES for words in commands(page) if "--dry-run" in words]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", DRY, ids=" ".join)
+def test_what_would_be_run_is_said(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cli.parse(arguments)()
+    assert re.search(r"\d+ episodes", capsys.readouterr().out)
+    assert not list(tmp_path.rglob("*.parquet"))
+
+
 def test_what_is_no_command_is_noticed(tmp_path):
     page = tmp_path / "page.md"
     loop = "for k in 0 1; do A=$k B=$(($(nproc) / 8)) mechsearch study gamma --out rows/$k & done  # all"
