@@ -28,6 +28,7 @@ _CELL = re.compile(r"<t[dh].*?</t[dh]>", re.DOTALL)
 # Code without other tags in it; where a long name in it may be broken.
 _PLAIN = re.compile(r"(?<=<code>)[^<]*(?=</code>)")
 _BREAK = re.compile(r"([._/|])(?=[A-Za-z])")
+_PICTURE = re.compile(r'<img [^>]*src="([^"]+)"[^>]*>')
 _INTERVAL = re.compile(r"\([-+]?[\d.]+ to [-+]?[\d.]+\)")
 _CODE = re.compile(r"(^```.*?^```$|`(?:[^`\n]|\n(?!\n))+`)", re.MULTILINE | re.DOTALL)
 
@@ -72,13 +73,14 @@ def on_page_markdown(markdown, page, config, files):
 def on_page_content(html, page, config, files):
     """Show bars in the code of a table as the repository's web view does, and keep an interval in one line.
 
-    A long name in a table may be broken after its dots and underscores.
+    A long name in a table may be broken after its dots and underscores, and a click on a picture opens it in its size.
     """
 
     def code(match):
         return _BREAK.sub(r"\1<wbr>", match[0].replace("\\|", "|"))
 
     html = _CELL.sub(lambda cell: _PLAIN.sub(code, cell[0]), html)
+    html = _PICTURE.sub(r'<a href="\1">\g<0></a>', html)
     return _INTERVAL.sub(lambda interval: interval[0].replace(" ", "&nbsp;"), html)
 
 
