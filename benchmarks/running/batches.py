@@ -18,6 +18,7 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.simulators.named import EngineName, new_simulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
@@ -162,11 +163,11 @@ class Batches:
 def _trials(stack: contextlib.ExitStack, name: str) -> Trials | None:
     """What tries actions out by name, in processes of its own beside a GPU; ended with the stack."""
     trials = rehearsal(name)
-    if jax.default_backend() == "cpu" or not isinstance(trials, NativeTrials):
+    if jax.default_backend() == "cpu" or not isinstance(trials, NativeTrials | LearningTrials):
         return trials
-    apart = ProcessTrials(trials)
+    apart = ProcessTrials(trials.simulation if isinstance(trials, LearningTrials) else trials)
     stack.callback(apart.close)
-    return apart
+    return dataclasses.replace(trials, trials=apart) if isinstance(trials, LearningTrials) else apart
 
 
 class _Batch:

@@ -103,6 +103,30 @@ class TrialScene(NativeWorld):
         scene._record()
         return scene._attempted(kind, reference, index, needed)
 
+    def ends(self, kind: Kind, reference: Reference) -> Float[np.ndarray, "2 9 3"]:
+        """Where the bodies come to rest after a motion, in two ways [m]; NaN if the simulation diverges. Uses no JAX.
+
+        The first is of an arm that goes on where it is held up, the second of one that stops there and goes back.
+
+        Args:
+          kind: of the action.
+          reference: of the arm, as NumPy arrays.
+        """
+        back, stopped = self._end(kind, reference, self.config.tracking_bound)
+        return np.stack([self._end(kind, reference, math.inf)[0] if stopped else back, back])
+
+    def _end(self, kind: Kind, reference: Reference, arm_stop: float) -> tuple[Float[np.ndarray, "9 3"], bool]:
+        """Where the bodies come to rest [m] if an arm stops at an error of `arm_stop`, and whether it does."""
+        scene = copy.copy(self)
+        scene._data = copy.copy(self._data)
+        scene._record()
+        _, stopped = scene._guarded(reference, arm_stop)
+        if kind.returns_home or stopped:
+            scene._go_home()
+        scene._rest_again(np.empty((0, 0)))
+        places = scene._data.qpos[ROBOT:].reshape(BODIES, 7)[:, :3].copy()
+        return np.full_like(places, np.nan) if self.diverged or scene._recorder.diverged else places, stopped
+
     def _attempted(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
     ) -> TrialResult | None:

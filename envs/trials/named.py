@@ -13,16 +13,17 @@ def rehearsal(name: str) -> Trials | None:
     """The `Trials` of a name; the same object for the same name.
 
     Args:
-      name: "physics" for a simulation, "none" for None.
+      name: "physics" for a simulation, "learning" for one that learns the friction as the search goes, "none" for None.
 
     Raises:
       InputError: there is no rehearsal of that name.
     """
     if name == "none":
         return None
-    if name != "physics":
-        raise InputError(f'rehearsal "{name}" is unknown; use none, physics')
+    if name not in ("physics", "learning"):
+        raise InputError(f'rehearsal "{name}" is unknown; use none, physics, learning')
     # Imported here so that "none" does without the simulator.
+    from mechsearch_jax.envs.trials.learning import LearningTrials
     from mechsearch_jax.envs.trials.native import NativeTrials
 
-    return NativeTrials()
+    return LearningTrials() if name == "learning" else NativeTrials()

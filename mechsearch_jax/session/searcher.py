@@ -45,6 +45,7 @@ from mechsearch_jax.perception.plausibility import (
     sight_faults,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, check_images
+from mechsearch_jax.planner.learning import restored
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
@@ -297,7 +298,11 @@ class Searcher:
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
         warnings += belief_faults(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
-        decision, motion = self._decide(decision_key, belief, observation, depth, Present(joints, width))
+        physics = restored(self._trials, now.physics)
+        if physics is not None and now.acted:
+            physics.learn_first(problem, now.belief, now.observation, now.action, observation)
+        trials = self._trials if physics is None else physics.trials([0])
+        decision, motion = self._decide(decision_key, trials, belief, observation, depth, Present(joints, width))
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -315,11 +320,18 @@ class Searcher:
         handed = motion.trajectory is not None
         refusals = now.refusals + (not handed)
         latest = now.index, belief, observation, decision.action
-        self._state = State(*latest, handed=handed, acted=False, finished=False, refusals=refusals)
+        learned = () if physics is None else tuple(physics.probabilities[0].tolist())
+        self._state = State(*latest, handed=handed, acted=False, finished=False, refusals=refusals, physics=learned)
         return step
 
     def _decide(
-        self, key: Array, belief: Belief, observation: Observation, depth: np.ndarray, present: Present
+        self,
+        key: Array,
+        trials: Trials | None,
+        belief: Belief,
+        observation: Observation,
+        depth: np.ndarray,
+        present: Present,
     ) -> tuple[Decision, Motion]:
         """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it.
 
@@ -328,7 +340,7 @@ class Searcher:
         problem, arm = self.problem, self.workcell.arm
         for draw in range(DRAWS):
             draw_key = jax.random.fold_in(key, draw) if draw else key
-            decision = decide(self._policy, self._trials, draw_key, problem, belief, observation)
+            decision = decide(self._policy, trials, draw_key, problem, belief, observation)
             motion = motion_of(problem, belief, observation, decision, depth, present, arm, self._motions)
             if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break

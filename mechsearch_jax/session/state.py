@@ -39,6 +39,7 @@ class State:
       acted: whether the action was executed or attempted since the last images.
       finished: whether the target was taken out.
       refusals: number of steps without a motion since the last action.
+      physics: how probable each hypothesis of trials that learn is; empty if they do not, or have not yet.
     """
 
     index: int
@@ -49,6 +50,7 @@ class State:
     acted: bool
     finished: bool
     refusals: int = 0
+    physics: tuple[float, ...] = ()
 
 
 _PLAIN: dict[str, Callable[[Any], Any]] = {
@@ -57,7 +59,10 @@ _PLAIN: dict[str, Callable[[Any], Any]] = {
     "acted": bool,
     "finished": bool,
     "refusals": int,
+    "physics": lambda values: tuple(map(float, values)),
 }
+# Of what was saved before they existed.
+_ADDED: dict[str, Any] = {"physics": ()}
 _PYTREES = ("belief", "observation", "action")
 
 
@@ -86,6 +91,7 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
         head = json.loads(str(arrays.pop("head")))
         if (head["format"], head["version"]) != (FORMAT, VERSION):
             raise ValueError
+        head = _ADDED | head
         kept, rest = head["digest"], {name: read(head[name]) for name, read in _PLAIN.items()}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: is no search that was saved; begin a new one") from error

@@ -1,0 +1,122 @@
+"""Trials that learn friction and mass from where objects come to rest after an action."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.actions import Action, ActionKind
+from mechsearch_jax.envs.trials.native import NativeTrials
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner import Problem
+from mechsearch_jax.planner.learning import posterior
+from mechsearch_jax.planner.trials import Trials, TrialScenes
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program
+
+
+@dataclasses.dataclass(frozen=True)
+class Hypothesis:
+    """What friction and mass may be.
+
+    Attributes:
+      friction, mass: multiples of the assumed sliding frictions and masses of all bodies.
+      weight: how probable it is before the first action, relative to the others.
+    """
+
+    friction: float = 1.0
+    mass: float = 1.0
+    weight: float = 1.0
+
+
+# From half to twice the assumed friction.
+FRICTIONS = (
+    Hypothesis(0.5, weight=0.1),
+    Hypothesis(0.7, weight=0.15),
+    Hypothesis(1.0, weight=0.5),
+    Hypothesis(1.4, weight=0.15),
+    Hypothesis(2.0, weight=0.1),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class LearningTrials:
+    """`Trials` that assume the most probable of some hypotheses; see `planner.learning.LearnsPhysics`.
+
+    An arm that is held up may go on or stop and go back: the way that fits better counts.
+
+    An approximation: what is not recognised is absent from the simulation, as it is from trials.
+
+    Attributes:
+      trials: in which actions are tried, under the hypothesis that they are to assume.
+      simulation: predicts where objects come to rest.
+      hypotheses: two or more.
+      spread: scale of the distance between where an object is predicted and where it is seen [m].
+
+    Raises:
+      InputError: there are too few hypotheses, or a number is not positive.
+    """
+
+    trials: Trials = dataclasses.field(default_factory=NativeTrials)
+    simulation: NativeTrials = dataclasses.field(default_factory=NativeTrials)
+    hypotheses: tuple[Hypothesis, ...] = FRICTIONS
+    spread: float = 0.006
+
+    def __post_init__(self) -> None:
+        if len(self.hypotheses) < 2:
+            raise InputError(f"LearningTrials: {len(self.hypotheses)} hypotheses are too few; give two at least")
+        for hypothesis in self.hypotheses:
+            if not all(0.0 < value < np.inf for value in dataclasses.astuple(hypothesis)):
+                raise InputError(f"LearningTrials: {hypothesis} must have positive numbers only")
+        if not 0.0 < self.spread < np.inf:
+            raise InputError(f"LearningTrials: spread {self.spread} must be a positive number")
+
+    @property
+    def prior(self) -> Float[np.ndarray, " h"]:
+        """See `LearnsPhysics`."""
+        weights = np.array([hypothesis.weight for hypothesis in self.hypotheses], np.float32)
+        return weights / weights.sum()
+
+    def __call__(
+        self, problem: Problem, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
+    ) -> Int[np.ndarray, "r k"]:
+        """See `trials.Trials`."""
+        return self.trials(problem, scenes, actions, wanted)
+
+    def programs(self, problem: Problem) -> list[Program]:
+        """The JAX programs of trials; see `many_slots.PreparesTrials`."""
+        return self.simulation.programs(problem)
+
+    def assumed(self, probabilities: Float[np.ndarray, "r h"], scenes: TrialScenes) -> TrialScenes:
+        """See `LearnsPhysics`."""
+        return _under([self.hypotheses[i] for i in probabilities.argmax(axis=1)], scenes)
+
+    def learned(
+        self,
+        problem: Problem,
+        probabilities: Float[np.ndarray, "r h"],
+        scenes: TrialScenes,
+        actions: Action,
+        seen: Superquadrics,
+    ) -> Float[np.ndarray, "r h"]:
+        """See `LearnsPhysics`."""
+        scenes, actions, seen = jax.device_get((scenes, actions, seen))
+        rows = np.flatnonzero(np.asarray(actions.kind) != ActionKind.NONE)
+        if not len(rows):
+            return probabilities
+        count, updated = len(self.hypotheses), probabilities.copy()
+        before, done = jax.tree.map(lambda a: np.repeat(np.asarray(a)[rows], count, axis=0), (scenes, actions))
+        ends = self.simulation.ends(problem, _under([*self.hypotheses] * len(rows), before), done)
+        for row, here in zip(rows, np.split(ends, len(rows)), strict=True):
+            there, position, visible = scenes.objects.valid[row], seen.position[row], seen.valid[row]
+            updated[row] = posterior(probabilities[row], here, there, position, visible, np.float32(self.spread))
+        return updated
+
+
+def _under(hypotheses: list[Hypothesis], scenes: TrialScenes) -> TrialScenes:
+    """Scenes with the friction and the mass of a hypothesis each."""
+    friction, mass = np.array([(h.friction, h.mass) for h in hypotheses], np.float32).T
+    return scenes.replace(friction=np.asarray(scenes.friction) * friction, mass=np.asarray(scenes.mass) * mass)
