@@ -168,9 +168,9 @@ def posterior(
       visible: which of them there are.
       spread: scale of the distance between a prediction and what is seen [m].
     """
-    apart = jnp.linalg.norm(ends[:, :, :, None] - seen, axis=-1)
-    nearest = jnp.min(jnp.where(visible, apart, jnp.inf), axis=-1)
-    misfit = jnp.sum(jnp.log1p((nearest / spread) ** 2), axis=-1, where=there)
+    apart = jnp.linalg.norm(ends[:, :, :, None] - seen[None, None, None], axis=-1)
+    nearest = jnp.min(jnp.where(visible[None, None, None], apart, jnp.inf), axis=-1)
+    misfit = jnp.sum(jnp.log1p((nearest / spread) ** 2), axis=-1, where=there[None, None])
     likelihood = -TAIL * jnp.min(misfit, axis=-1)
     usable = jnp.all(jnp.isfinite(likelihood))
     after = jax.nn.softmax(jnp.log(probabilities) + jnp.where(usable, likelihood, 0.0))
