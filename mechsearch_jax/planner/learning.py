@@ -168,11 +168,30 @@ def posterior(
       visible: which of them there are.
       spread: scale of the distance between a prediction and what is seen [m].
     """
-    apart = jnp.linalg.norm(ends[:, :, :, None] - seen[None, None, None], axis=-1)
-    nearest = jnp.min(jnp.where(visible[None, None, None], apart, jnp.inf), axis=-1)
-    misfit = jnp.sum(jnp.log1p((nearest / spread) ** 2), axis=-1, where=there[None, None])
+    misfit = jnp.sum(jnp.log1p((_nearest(ends, seen, visible) / spread) ** 2), axis=-1, where=there[None, None])
     likelihood = -TAIL * jnp.min(misfit, axis=-1)
     usable = jnp.all(jnp.isfinite(likelihood))
     after = jax.nn.softmax(jnp.log(probabilities) + jnp.where(usable, likelihood, 0.0))
     after = jnp.maximum(after, LEAST)
     return jnp.where(usable, after / jnp.sum(after), probabilities)
+
+
+@kept(on_host=True)
+def fits(
+    ends: Float[Array, "w n 3"],
+    there: Bool[Array, " n"],
+    seen: Float[Array, "m 3"],
+    visible: Bool[Array, " m"],
+    spread: Float[Array, ""],
+) -> Bool[Array, ""]:
+    """Whether one of the ways of a hypothesis has every object come to rest near one that is seen; as `posterior`."""
+    near = _nearest(ends[None], seen, visible)[0] < spread
+    return jnp.any(jnp.all(near | ~there[None], axis=1))
+
+
+def _nearest(
+    ends: Float[Array, "h w n 3"], seen: Float[Array, "m 3"], visible: Bool[Array, " m"]
+) -> Float[Array, "h w n"]:
+    """Distance of each predicted object from the nearest that is seen [m]."""
+    apart = jnp.linalg.norm(ends[:, :, :, None] - seen[None, None, None], axis=-1)
+    return jnp.min(jnp.where(visible[None, None, None], apart, jnp.inf), axis=-1)
