@@ -65,11 +65,12 @@ def test_trials_assume_what_is_most_probable(problem):
     model = LearningTrials()
     assumed = []
 
-    def spy_on(problem, scenes, actions, wanted):
-        assumed.append(scenes)
-        return np.zeros((2, 1), np.int32)
+    class Spy(NativeTrials):
+        def __call__(self, problem, scenes, actions, wanted):
+            assumed.append(scenes)
+            return np.zeros((2, 1), np.int32)
 
-    spy = dataclasses.replace(model, trials=spy_on)
+    spy = dataclasses.replace(model, trials=Spy())
     physics = LearnedPhysics(spy, 2)
     physics.probabilities[1] = [0.0, 0.0, 0.1, 0.2, 0.7]
     two = jax.tree.map(lambda a: np.stack([a, a]), scenes_of(initial_belief(problem), pushed(problem, 1.0)[0]))

@@ -163,9 +163,10 @@ class Batches:
 def _trials(stack: contextlib.ExitStack, name: str) -> Trials | None:
     """What tries actions out by name, in processes of its own beside a GPU; ended with the stack."""
     trials = rehearsal(name)
-    if jax.default_backend() == "cpu" or not isinstance(trials, NativeTrials | LearningTrials):
+    native = trials.trials if isinstance(trials, LearningTrials) else trials
+    if jax.default_backend() == "cpu" or not isinstance(native, NativeTrials):
         return trials
-    apart = ProcessTrials(trials.simulation if isinstance(trials, LearningTrials) else trials)
+    apart = ProcessTrials(native)
     stack.callback(apart.close)
     return dataclasses.replace(trials, trials=apart) if isinstance(trials, LearningTrials) else apart
 

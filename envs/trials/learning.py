@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -17,6 +17,18 @@ from mechsearch_jax.planner.learning import fits, posterior
 from mechsearch_jax.planner.trials import Trials, TrialScenes
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program
+
+
+class PredictsEnds(Trials, Protocol):
+    """`Trials` that also say where objects come to rest: `NativeTrials`, `ProcessTrials`."""
+
+    def ends(self, problem: Problem, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+        """See `NativeTrials.ends`."""
+        ...
+
+    def programs(self, problem: Problem) -> list[Program]:
+        """See `many_slots.PreparesTrials`."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +65,7 @@ class LearningTrials:
     An approximation: what is not recognised is absent from the simulation, as it is from trials.
 
     Attributes:
-      trials: in which actions are tried, under the hypothesis that they are to assume.
-      simulation: predicts where objects come to rest.
+      trials: in which actions are tried, and which say where objects come to rest.
       hypotheses: two or more.
       spread: scale of the distance between where an object is predicted and where it is seen [m].
 
@@ -62,8 +73,7 @@ class LearningTrials:
       InputError: there are too few hypotheses, or a number is not positive.
     """
 
-    trials: Trials = dataclasses.field(default_factory=NativeTrials)
-    simulation: NativeTrials = dataclasses.field(default_factory=NativeTrials)
+    trials: PredictsEnds = dataclasses.field(default_factory=NativeTrials)
     hypotheses: tuple[Hypothesis, ...] = FRICTIONS
     spread: float = 0.006
 
@@ -90,7 +100,7 @@ class LearningTrials:
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
-        return self.simulation.programs(problem)
+        return self.trials.programs(problem)
 
     def assumed(self, probabilities: Float[np.ndarray, "r h"], scenes: TrialScenes) -> TrialScenes:
         """See `LearnsPhysics`."""
@@ -114,7 +124,7 @@ class LearningTrials:
             rows = np.array([row for row, _ in pairs])
             before, done = jax.tree.map(lambda a: np.asarray(a)[rows], (scenes, actions))
             under = _under([self.hypotheses[h] for _, h in pairs], before)
-            return dict(zip(pairs, self.simulation.ends(problem, under, done), strict=True))
+            return dict(zip(pairs, self.trials.ends(problem, under, done), strict=True))
 
         def look(row: int) -> tuple[Any, ...]:
             there = np.asarray(scenes.objects.valid)[row]

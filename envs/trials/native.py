@@ -130,7 +130,10 @@ class NativeTrials:
           scenes: R scenes.
           actions: one for each, of a kind that moves the arm.
         """
-        cell = Cell(problem.target, problem.shelf, problem.gripper)
+        return self.ends_in_cell(Cell(problem.target, problem.shelf, problem.gripper), scenes, actions)
+
+    def ends_in_cell(self, cell: Cell, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+        """`ends` without a problem."""
         simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
         actions, scenes = jax.device_get((actions, scenes))
         count = scenes.objects.valid.shape[-1]

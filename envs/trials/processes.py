@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import loky
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.trials.native import Cell, NativeTrials
@@ -75,6 +75,23 @@ class ProcessTrials:
             for row in rows:
                 results[row] = self._alone(functools.partial(begin, row), wanted.shape[1])
         return results
+
+    def ends(self, problem: Problem, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+        """See `NativeTrials.ends`; NaN, with a warning, if a process dies."""
+        cell = _cell(problem)
+        scenes, actions = jax.device_get((scenes, actions))
+        count = len(scenes.found)
+        rows = [jax.tree.map(lambda a, row=row: a[row : row + 1], (scenes, actions)) for row in range(count)]
+        try:
+            pending = [self._workers().submit(_ends, self.trials, cell, *row) for row in rows]
+            return np.concatenate([future.result() for future in pending])
+        except BrokenExecutor as error:
+            self.close()
+            warnings.warn(
+                f"a process died as it simulated {count} actions ({type(error).__name__}); they teach nothing",
+                stacklevel=3,
+            )
+            return np.full((count, 2, scenes.objects.valid.shape[-1], 3), np.nan, np.float32)
 
     def programs(self, problem: Problem) -> list[Program]:
         """A program that starts the processes and prepares each; see `many_slots.PreparesTrials`."""
@@ -149,3 +166,8 @@ def _row(
 ) -> Int[np.ndarray, " k"]:
     """The results of the actions of a single scene."""
     return trials.in_cell(cell, scenes, actions, wanted)[0]
+
+
+def _ends(trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "1 2 n 3"]:
+    """Where the objects of a single scene come to rest."""
+    return trials.ends_in_cell(cell, scenes, actions)
