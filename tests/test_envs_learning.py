@@ -25,7 +25,7 @@ from mechsearch_jax.planner.trials import scenes_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Slides if it is pushed near the board, and leans over in front of a higher hand if the board is rough.
+# Falls over in front of so high a hand; where it comes to lie hangs on the friction.
 TALL = standing("cylinder", (0.03, 0.03, 0.09), 0.55, 0.1)
 BEFORE = scene(TALL, target=standing("cylinder", (0.02, 0.02, 0.05), 0.7, -0.2))
 PUSH = push(pose(0.56, 0.1 - 0.07, 0.1), (0.0, 0.15, 0.0))
@@ -164,13 +164,15 @@ def test_an_arm_that_is_held_up_may_stop_and_go_back():
 
 
 def test_an_arm_that_may_stop_does_as_any_other_where_it_is_not_held_up():
+    box = standing("box", (0.078, 0.022, 0.096), 0.55, 0.1)
+    action = push(pose(0.595, 0.1 - 0.1345, 0.04, tilt=math.radians(30)), (0.0, 0.15, 0.0))
     places = []
     for arm_stop in (0.0, 0.03):
         simulator = NativeWorld()
-        simulator.reset(BEFORE, ASSUMED_CELL._replace(arm_stop=arm_stop))
-        assert simulator.execute(PUSH).reason() is None
+        simulator.reset(scene(box), ASSUMED_CELL._replace(arm_stop=arm_stop))
+        assert simulator.execute(action).reason() is None
         places.append(np.asarray(simulator.world.position))
-    assert np.abs(places[1] - places[0]).max() < 1e-3
+    assert np.abs(places[1] - places[0]).max() < 2e-3
 
 
 def test_trials_say_where_objects_end_if_the_arm_goes_on_and_if_it_goes_back(problem):
