@@ -23,6 +23,7 @@ from mechsearch_jax.planner import initial_belief, search_for_grasp
 from mechsearch_jax.planner.learning import LEAST, LearnedPhysics, LearnsPhysics, posterior, restored
 from mechsearch_jax.planner.trials import scenes_of
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.state import beginning, load_state, save_state
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Falls over in front of so high a hand; where it comes to lie hangs on the friction.
@@ -135,6 +136,12 @@ def test_only_trials_that_learn_are_asked_to():
     assert restored(rehearsal("learning"), [0.2] * 5).probabilities[0] == pytest.approx(0.2)
     with pytest.raises(InputError, match="2 probabilities for 5 hypotheses"):
         restored(rehearsal("learning"), [0.5, 0.5])
+
+
+def test_what_was_learned_is_saved(problem, tmp_path):
+    saved = dataclasses.replace(beginning(problem), physics=(0.25, 0.75))
+    save_state(saved, "digest", tmp_path / "search.npz")
+    assert load_state(problem, "digest", tmp_path / "search.npz").physics == (0.25, 0.75)
 
 
 @pytest.mark.parametrize(
