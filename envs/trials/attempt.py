@@ -112,20 +112,21 @@ class TrialScene(NativeWorld):
           kind: of the action.
           reference: of the arm, as NumPy arrays.
         """
-        back, stopped = self._end(kind, reference, self.config.tracking_bound)
-        return np.stack([self._end(kind, reference, math.inf)[0] if stopped else back, back])
+        on, held_up = self._end(kind, reference, stops=False)
+        return np.stack([on, self._end(kind, reference, stops=True)[0] if held_up else on])
 
-    def _end(self, kind: Kind, reference: Reference, arm_stop: float) -> tuple[Float[np.ndarray, "9 3"], bool]:
-        """Where the bodies come to rest [m] if an arm stops at an error of `arm_stop`, and whether it does."""
-        scene = copy.copy(self)
+    def _end(self, kind: Kind, reference: Reference, stops: bool) -> tuple[Float[np.ndarray, "9 3"], bool]:
+        """Where the bodies come to rest [m] if an arm that is held up stops or not, and whether it is held up."""
+        scene, bound = copy.copy(self), self.config.tracking_bound
         scene._data = copy.copy(self._data)
         scene._record()
-        _, stopped = scene._guarded(reference, arm_stop)
+        states, stopped = scene._guarded(reference, bound) if stops else (scene._follow(reference), False)
+        held_up = stopped or self._tracking_error(states, reference) > bound
         if kind.returns_home or stopped:
             scene._go_home()
         scene._rest_again(np.empty((0, 0)))
         places = scene._data.qpos[ROBOT:].reshape(BODIES, 7)[:, :3].copy()
-        return np.full_like(places, np.nan) if self.diverged or scene._recorder.diverged else places, stopped
+        return np.full_like(places, np.nan) if self.diverged or scene._recorder.diverged else places, held_up
 
     def _attempted(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
