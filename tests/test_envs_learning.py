@@ -30,6 +30,9 @@ from mechsearch_jax.workspace.shelf import Shelf
 TALL = standing("cylinder", (0.03, 0.03, 0.09), 0.55, 0.1)
 BEFORE = scene(TALL, target=standing("cylinder", (0.02, 0.02, 0.05), 0.7, -0.2))
 PUSH = push(pose(0.56, 0.1 - 0.07, 0.1), (0.0, 0.15, 0.0))
+# A bottle at the front edge, and a push over it.
+EDGE = standing("cylinder", (0.024, 0.024, 0.067), 0.43, 0.1)
+OVER = push(pose(0.505, 0.1 - 0.1365, 0.04, tilt=math.radians(30)), (-0.05, 0.12, 0.0))
 # A box that cannot move as far to the left as the hand is to go.
 WEDGED = standing("box", (0.078, 0.048, 0.1), 0.6, Shelf().left - 0.078)
 START = pose(0.62, WEDGED.position[1] - 0.048 - 0.1125, 0.06, tilt=math.radians(30))
@@ -96,20 +99,72 @@ def test_what_cannot_be_simulated_teaches_nothing(problem):
     assert physics.probabilities[0] == pytest.approx(LearningTrials().prior)
 
 
-def test_the_posterior_is_bayes_rule_of_the_nearest_objects():
-    prior, spread = np.array([0.25, 0.75], np.float32), np.float32(0.01)
+PRIOR = np.array([0.1, 0.15, 0.5, 0.15, 0.1], np.float32)
+SPREAD = 0.006
+
+
+def after_one(predicted, seen):
+    """The posterior where each hypothesis has objects come to rest in these places of (H, N, 3), in one way."""
+    predicted, seen = np.asarray(predicted, np.float32), np.asarray(seen, np.float32).reshape(-1, 3)
+    there, visible = np.ones(predicted.shape[1], bool), np.ones(len(seen), bool)
+    return posterior(PRIOR, predicted[:, None], there, seen, visible, SPREAD)
+
+
+def test_the_posterior_is_bayes_rule():
+    prior, spread = np.array([0.25, 0.75], np.float32), 0.01
     ends = np.zeros((2, 2, 2, 3), np.float32)
     # The first hypothesis is right in its second way; the second is a spread off in both. The second object is none.
     ends[0, 0, 0, 0], ends[1, :, 0, 0], ends[:, :, 1] = 0.5, 0.01, 9.0
     there, visible = np.array([True, False]), np.array([False, True, True])
     places = np.array([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], np.float32)
-    after = np.asarray(posterior(prior, ends, there, places, visible, spread))
-    odds = 0.25 / (0.75 * 2.0**-1.5)
-    assert after[0] / after[1] == pytest.approx(odds, rel=1e-4)
-    blind = posterior(prior, ends, there, places, np.zeros(3, bool), spread)
-    assert np.asarray(blind) == pytest.approx(prior)
-    ends[1] += 1e3
-    assert np.asarray(posterior(prior, ends, there, places, visible, spread)).min() == pytest.approx(LEAST, rel=0.01)
+    after = posterior(prior, ends, there, places, visible, spread)
+    assert after[0] / after[1] == pytest.approx(0.25 / (0.75 * 2.0**-1.5), rel=1e-4)
+    assert posterior(prior, ends, there, places, np.zeros(3, bool), spread) == pytest.approx(prior)
+    for _ in range(3):
+        ends[1], prior = 9.0, posterior(prior, ends, there, places, visible, spread)
+    assert prior.min() == pytest.approx(LEAST, rel=0.01)
+
+
+def test_what_fits_is_evidence_for_what_was_assumed():
+    """Actions that end near where the assumed friction has them end make another less probable."""
+    predicted = np.zeros((5, 1, 3))
+    predicted[:, 0, 0] = 0.007, 0.007, 0.001, 0.007, 0.007
+    assert after_one(predicted, [[0.0, 0.0, 0.0]])[2] > 0.6
+
+
+def test_an_object_that_is_not_seen_does_not_decide_alone():
+    """Whatever else is nearest to where hypotheses have it come to rest."""
+    predicted = np.zeros((5, 2, 3))
+    predicted[:, 1, 0] = 0.1, 0.1, 0.1, 0.065, 0.06
+    assert after_one(predicted, [[0.0, 0.0, 0.0]]) == pytest.approx(PRIOR)
+
+
+def test_two_objects_are_not_seen_in_one():
+    """A hypothesis that has two objects come to rest in one place explains only one that is seen there."""
+    predicted = np.zeros((5, 2, 3))
+    predicted[:4, 1, 0] = 0.02
+    after = after_one(predicted, [[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+    assert after[4] < 0.01
+
+
+def test_an_object_that_is_gone_is_evidence_for_its_fall_and_one_that_stays_against_it():
+    predicted = np.zeros((5, 2, 3))
+    predicted[:, 1, 0] = 0.08
+    predicted[4, 1] = np.inf
+    gone = after_one(predicted, [[0.0, 0.0, 0.0]])
+    assert PRIOR[4] < gone[4] < 0.5
+    assert after_one(predicted, [[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]])[4] < 0.01
+
+
+def test_what_diverges_does_not_keep_the_others_from_learning():
+    ends = np.zeros((5, 2, 1, 3), np.float32)
+    ends[0], ends[1, 1], ends[2, :, 0, 0] = np.nan, np.nan, 0.02
+    visible = np.ones(1, bool)
+    after = posterior(PRIOR, ends, visible, np.zeros((1, 3), np.float32), visible, SPREAD)
+    assert after[0] == pytest.approx(PRIOR[0], abs=1e-3)
+    assert after[2] < 0.1
+    assert after[1] > PRIOR[1]
+    assert after.sum() == pytest.approx(1.0)
 
 
 def test_slots_learn_between_looks_and_forget(problem):
@@ -180,6 +235,13 @@ def test_an_arm_that_may_stop_does_as_any_other_where_it_is_not_held_up():
         assert simulator.execute(action).reason() is None
         places.append(np.asarray(simulator.world.position))
     assert np.abs(places[1] - places[0]).max() < 2e-3
+
+
+def test_what_leaves_the_board_ends_nowhere(problem):
+    observation = seen(problem, from_scenario(scene(EDGE)))
+    row = jax.tree.map(lambda a: np.asarray(a)[None], (scenes_of(initial_belief(problem), observation), OVER))
+    ends = NativeTrials(threads=1).ends(problem, *row)[0]
+    assert np.isinf(ends[:, 0]).all()
 
 
 def test_trials_say_where_objects_end_if_the_arm_goes_on_and_if_it_goes_back(problem):

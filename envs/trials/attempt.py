@@ -104,8 +104,9 @@ class TrialScene(NativeWorld):
         return scene._attempted(kind, reference, index, needed)
 
     def ends(self, kind: Kind, reference: Reference) -> Float[np.ndarray, "2 9 3"]:
-        """Where the bodies come to rest after a motion, in two ways [m]; NaN if the simulation diverges. Uses no JAX.
+        """Where the bodies come to rest after a motion, in two ways [m]. Uses no JAX.
 
+        Bodies off the board are infinitely far; all is NaN if the simulation diverges.
         The first is of an arm that goes on where it is held up, the second of one that stops there and goes back.
 
         Args:
@@ -126,6 +127,7 @@ class TrialScene(NativeWorld):
             scene._go_home()
         scene._rest_again(np.empty((0, 0)))
         places = scene._data.qpos[ROBOT:].reshape(BODIES, 7)[:, :3].copy()
+        places[scene._fallen()] = np.inf
         return np.full_like(places, np.nan) if self.diverged or scene._recorder.diverged else places, held_up
 
     def _attempted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Problem
-from mechsearch_jax.planner.learning import fits, posterior
+from mechsearch_jax.planner.learning import posterior
 from mechsearch_jax.planner.trials import Trials, TrialScenes
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program
@@ -59,8 +59,8 @@ FRICTIONS = (
 class LearningTrials:
     """`Trials` that assume the most probable of some hypotheses; see `planner.learning.LearnsPhysics`.
 
-    After an action the assumed hypothesis is simulated, and the others only where it does not fit what is seen. An arm
-    that is held up may go on or stop and go back: the way that fits better counts.
+    After an action it is simulated under every hypothesis. An arm that is held up may go on or stop and go back: the
+    way that fits better counts.
 
     An approximation: what is not recognised is absent from the simulation, as it is from trials.
 
@@ -116,29 +116,16 @@ class LearningTrials:
     ) -> Float[np.ndarray, "r h"]:
         """See `LearnsPhysics`."""
         scenes, actions, seen = jax.device_get((scenes, actions, seen))
-
-        def predicted(pairs: list[tuple[int, int]]) -> dict[tuple[int, int], Float[np.ndarray, "2 n 3"]]:
-            """Where objects come to rest in rows, each under one of the hypotheses."""
-            if not pairs:
-                return {}
-            rows = np.array([row for row, _ in pairs])
-            before, done = jax.tree.map(lambda a: np.asarray(a)[rows], (scenes, actions))
-            under = _under([self.hypotheses[h] for _, h in pairs], before)
-            return dict(zip(pairs, self.trials.ends(problem, under, done), strict=True))
-
-        def look(row: int) -> tuple[Any, ...]:
-            there = np.asarray(scenes.objects.valid)[row]
-            return there, np.asarray(seen.position)[row], np.asarray(seen.valid)[row], np.float32(self.spread)
-
-        assumed, updated = probabilities.argmax(axis=1).tolist(), probabilities.copy()
-        acted = np.flatnonzero(np.asarray(actions.kind) != ActionKind.NONE).tolist()
-        ends = predicted([(row, assumed[row]) for row in acted])
-        surprised = [row for row in acted if not fits(ends[row, assumed[row]], *look(row))]
-        every = range(len(self.hypotheses))
-        ends |= predicted([(row, h) for row in surprised for h in every if h != assumed[row]])
-        for row in surprised:
-            here = np.stack([ends[row, h] for h in every])
-            updated[row] = posterior(probabilities[row], here, *look(row))
+        acted = np.flatnonzero(np.asarray(actions.kind) != ActionKind.NONE)
+        updated, count = probabilities.copy(), len(self.hypotheses)
+        if not len(acted):
+            return updated
+        before, executed = jax.tree.map(lambda a: np.repeat(np.asarray(a)[acted], count, axis=0), (scenes, actions))
+        ends = self.trials.ends(problem, _under([*self.hypotheses] * len(acted), before), executed)
+        for row, predicted in zip(acted.tolist(), np.split(ends, len(acted)), strict=True):
+            there, visible = np.asarray(scenes.objects.valid)[row], np.asarray(seen.valid)[row]
+            places = np.asarray(seen.position)[row]
+            updated[row] = posterior(probabilities[row], predicted, there, places, visible, self.spread)
         return updated
 
 

@@ -121,8 +121,9 @@ class NativeTrials:
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
 
     def ends(self, problem: Problem, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
-        """Where the objects' centres come to rest after an action in each scene [m]; NaN where it cannot be simulated.
+        """Where the objects' centres come to rest after an action in each scene [m].
 
+        Objects off the board are infinitely far; all is NaN where the action cannot be simulated.
         Twice: if an arm that is held up goes on, and if it stops and goes back the way it came.
 
         Args:

@@ -7,13 +7,14 @@ next is their likelihood (Bayes' rule), and the trials after it assume the most 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
 
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief
@@ -21,13 +22,16 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.trials import Trials, TrialScenes, scenes_of
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 
-# Exponent of the likelihood's tails, which are those of Student's t distribution with two degrees of freedom: what is
-# hidden, or was pushed by something that the simulation lacks, must not decide alone.
+# Exponent of the likelihood (1 + r^2)^-TAIL of a distance of r spreads, whose tails are heavy.
 TAIL = 1.5
-# No hypothesis becomes less probable than this, so that a wrong conclusion can be corrected.
+# Distance, in spreads, beyond which an object counts as not seen: one that is hidden, not recognised, or pushed by
+# something that the simulation lacks must not decide alone, wherever hypotheses predict it.
+FARTHEST = 5.0
+# Probability that an object on the board is not seen, relative to that of one off the board.
+MISSED = 0.2
+# Before normalisation no hypothesis is less probable than this, so that a wrong conclusion can be corrected.
 LEAST = 1e-3
 
 
@@ -146,52 +150,57 @@ def restored(trials: Trials | None, probabilities: Sequence[float]) -> LearnedPh
     return physics
 
 
-@kept(on_host=True)
 def posterior(
-    probabilities: Float[Array, " h"],
-    ends: Float[Array, "h w n 3"],
-    there: Bool[Array, " n"],
-    seen: Float[Array, "m 3"],
-    visible: Bool[Array, " m"],
-    spread: Float[Array, ""],
-) -> Float[Array, " h"]:
+    probabilities: Float[np.ndarray, " h"],
+    ends: Float[np.ndarray, "h w n 3"],
+    there: Bool[np.ndarray, " n"],
+    seen: Float[np.ndarray, "m 3"],
+    visible: Bool[np.ndarray, " m"],
+    spread: float,
+) -> Float[np.ndarray, " h"]:
     """The probabilities of hypotheses after a look at a scene.
 
-    Objects are matched with the nearest that is seen. Nothing changes where nothing is seen, or where a prediction is
-    not finite.
+    A way that is not finite does not count, and a hypothesis without a finite way keeps its probability.
 
     Args:
       probabilities: before.
-      ends: where each hypothesis has the objects' centres come to rest [m], in W ways of which the likelier counts.
+      ends: where each hypothesis has the objects' centres come to rest [m], in W ways of which the likelier counts;
+        infinite for an object off the board, NaN for a way that could not be simulated.
       there: which objects there were.
       seen: centres of the objects that are seen [m].
       visible: which of them there are.
       spread: scale of the distance between a prediction and what is seen [m].
     """
-    misfit = jnp.sum(jnp.log1p((_nearest(ends, seen, visible) / spread) ** 2), axis=-1, where=there[None, None])
-    likelihood = -TAIL * jnp.min(misfit, axis=-1)
-    usable = jnp.all(jnp.isfinite(likelihood))
-    after = jax.nn.softmax(jnp.log(probabilities) + jnp.where(usable, likelihood, 0.0))
-    after = jnp.maximum(after, LEAST)
-    return jnp.where(usable, after / jnp.sum(after), probabilities)
+    ways = [[_misfit(places[there], seen[visible], spread) for places in hypothesis] for hypothesis in ends]
+    misfit = np.fmin.reduce(np.array(ways), axis=1)
+    simulated = np.isfinite(misfit)
+    if not simulated.any():
+        return probabilities
+    before = np.maximum(probabilities, LEAST)
+    weights = before[simulated] * np.exp(-TAIL * (misfit[simulated] - misfit[simulated].min()))
+    after = before.copy()
+    after[simulated] = before[simulated].sum() * weights / weights.sum()
+    after = np.maximum(after, LEAST)
+    return after / after.sum()
 
 
-@kept(on_host=True)
-def fits(
-    ends: Float[Array, "w n 3"],
-    there: Bool[Array, " n"],
-    seen: Float[Array, "m 3"],
-    visible: Bool[Array, " m"],
-    spread: Float[Array, ""],
-) -> Bool[Array, ""]:
-    """Whether one of the ways of a hypothesis has every object come to rest near one that is seen; as `posterior`."""
-    near = _nearest(ends[None], seen, visible)[0] < spread
-    return jnp.any(jnp.all(near | ~there[None], axis=1))
+def _misfit(predicted: Float[np.ndarray, "k 3"], seen: Float[np.ndarray, "m 3"], spread: float) -> float:
+    """How far predicted places are from what is seen, of the best assignment of each to at most one that is seen.
+
+    What comes into sight costs nothing. NaN if a place is NaN.
+    """
+    if np.isnan(predicted).any():
+        return math.nan
+    there, visible = len(predicted), len(seen)
+    off = ~np.isfinite(predicted).all(axis=1)
+    cost = np.zeros((max(there, visible),) * 2)
+    cost[:there] = _cost(FARTHEST)
+    cost[np.flatnonzero(off), visible:] += math.log(MISSED) / TAIL
+    apart = np.linalg.norm(predicted[~off, None] - seen[None], axis=-1)
+    cost[np.flatnonzero(~off), :visible] = _cost(np.minimum(apart / spread, FARTHEST))
+    return float(cost[linear_sum_assignment(cost)].sum())
 
 
-def _nearest(
-    ends: Float[Array, "h w n 3"], seen: Float[Array, "m 3"], visible: Bool[Array, " m"]
-) -> Float[Array, "h w n"]:
-    """Distance of each predicted object from the nearest that is seen [m]."""
-    apart = jnp.linalg.norm(ends[:, :, :, None] - seen[None, None, None], axis=-1)
-    return jnp.min(jnp.where(visible[None, None, None], apart, jnp.inf), axis=-1)
+def _cost(distance: Any) -> Any:
+    """The misfit of a distance in spreads."""
+    return np.log1p(np.square(distance))
