@@ -23,6 +23,7 @@ from mechsearch_jax.planner import initial_belief, search_for_grasp
 from mechsearch_jax.planner.learning import LEAST, LearnedPhysics, LearnsPhysics, posterior, restored
 from mechsearch_jax.planner.trials import scenes_of
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.session.state import beginning, load_state, save_state
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -187,16 +188,62 @@ def test_slots_learn_between_looks_and_forget(problem):
 def test_only_trials_that_learn_are_asked_to():
     assert isinstance(rehearsal("learning"), LearnsPhysics)
     assert not isinstance(rehearsal("physics"), LearnsPhysics)
-    assert restored(rehearsal("physics"), ()) is None
-    assert restored(rehearsal("learning"), [0.2] * 5).probabilities[0] == pytest.approx(0.2)
-    with pytest.raises(InputError, match="2 probabilities for 5 hypotheses"):
-        restored(rehearsal("learning"), [0.5, 0.5])
+    assert restored(rehearsal("physics"), {}) is None
 
 
 def test_what_was_learned_is_saved(problem, tmp_path):
-    saved = dataclasses.replace(beginning(problem), physics=(0.25, 0.75))
+    learned = {"friction 1, mass 1": 0.25, "friction 2, mass 1": 0.75}
+    saved = dataclasses.replace(beginning(problem), executed=False, hypothesis_probabilities=learned)
     save_state(saved, "digest", tmp_path / "search.npz")
-    assert load_state(problem, "digest", tmp_path / "search.npz").physics == (0.25, 0.75)
+    loaded = load_state(problem, "digest", tmp_path / "search.npz")
+    assert loaded.hypothesis_probabilities == learned
+    assert not loaded.executed
+
+
+TWO = LearningTrials(hypotheses=(Hypothesis(), Hypothesis(2.0)))
+
+
+@pytest.mark.parametrize(
+    ("trials", "values", "message"),
+    [
+        (rehearsal("learning"), (0.5, 0.5), "friction 1, mass 1; friction 2, mass 1 were learned, but the trials have"),
+        (NativeTrials(), (0.5, 0.5), "the trials learn nothing"),
+        (TWO, (math.nan, 0.5), "impossible"),
+        (TWO, (-0.5, 1.5), "impossible"),
+        (TWO, (0.0, 0.0), "impossible"),
+    ],
+)
+def test_what_other_trials_learned_or_is_damaged_is_not_loaded(problem, trials, values, message, tmp_path):
+    saver, loader = Searcher(rehearsal=TWO), Searcher(rehearsal=trials)
+    saver.problem = loader.problem = problem
+    saver._state = dataclasses.replace(
+        beginning(problem), hypothesis_probabilities=dict(zip(TWO.names, values, strict=True))
+    )
+    saver.save(tmp_path / "search.npz")
+    with pytest.raises(InputError, match=rf"search\.npz: .*{message}"):
+        loader.load(tmp_path / "search.npz")
+    assert loader._now.hypothesis_probabilities == {}
+
+
+def test_what_was_learned_goes_on(problem, tmp_path):
+    saver, loader = Searcher(rehearsal=TWO), Searcher(rehearsal=TWO)
+    saver.problem = loader.problem = problem
+    learned = dict(zip(TWO.names, (0.25, 0.75), strict=True))
+    saver._state = dataclasses.replace(beginning(problem), hypothesis_probabilities=learned)
+    saver.save(tmp_path / "search.npz")
+    loader.load(tmp_path / "search.npz")
+    assert loader._learned(loader._now.observation).first == learned
+
+
+@pytest.mark.parametrize("ok", [True, False])
+def test_a_searcher_learns_from_actions_that_were_executed_to_their_end(problem, ok):
+    before, after = pushed(problem, 2.0)
+    searcher = Searcher(rehearsal=LearningTrials(NativeTrials(threads=1)))
+    searcher.problem = problem
+    searcher._state = dataclasses.replace(beginning(problem), observation=before, action=PUSH, handed=True)
+    searcher.acted(ok=ok)
+    probabilities = searcher._learned(after).probabilities[0]
+    assert (probabilities == pytest.approx(LearningTrials().prior)) == (not ok)
 
 
 @pytest.mark.parametrize(
@@ -204,6 +251,7 @@ def test_what_was_learned_is_saved(problem, tmp_path):
     [
         ({"hypotheses": FRICTIONS[:1]}, "two at least"),
         ({"hypotheses": (Hypothesis(0.0), Hypothesis())}, "positive numbers"),
+        ({"hypotheses": (Hypothesis(), Hypothesis(weight=2.0))}, "hypotheses are equal"),
         ({"spread": 0.0}, "spread 0.0"),
     ],
 )

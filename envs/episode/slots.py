@@ -128,7 +128,7 @@ class OneSlot:
         self.truth: Truth | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
-        self._physics = restored(trials, ())
+        self._physics = restored(trials, {})
         self._sensing: Sensing | None = None
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:

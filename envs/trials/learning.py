@@ -70,7 +70,7 @@ class LearningTrials:
       spread: scale of the distance between where an object is predicted and where it is seen [m].
 
     Raises:
-      InputError: there are too few hypotheses, or a number is not positive.
+      InputError: there are too few hypotheses, two are equal, or a number is not positive.
     """
 
     trials: PredictsEnds = dataclasses.field(default_factory=NativeTrials)
@@ -83,8 +83,15 @@ class LearningTrials:
         for hypothesis in self.hypotheses:
             if not all(0.0 < value < np.inf for value in dataclasses.astuple(hypothesis)):
                 raise InputError(f"LearningTrials: {hypothesis} must have positive numbers only")
+        if len(set(self.names)) < len(self.names):
+            raise InputError(f"LearningTrials: hypotheses are equal: {'; '.join(self.names)}; give each once")
         if not 0.0 < self.spread < np.inf:
             raise InputError(f"LearningTrials: spread {self.spread} must be a positive number")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """See `LearnsPhysics`."""
+        return tuple(f"friction {h.friction:g}, mass {h.mass:g}" for h in self.hypotheses)
 
     @property
     def prior(self) -> Float[np.ndarray, " h"]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -42,6 +42,11 @@ class LearnsPhysics(Protocol):
     @property
     def prior(self) -> Float[np.ndarray, " h"]:
         """How probable each hypothesis is before the first action."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Distinct names of the hypotheses, by which what is learned is saved."""
         ...
 
     def learned(
@@ -123,30 +128,45 @@ class LearnedPhysics:
         acted = scenes_of(belief, before), action, after.objects
         self.learn(problem, [0], *jax.tree.map(lambda a: np.asarray(a)[None], acted))
 
+    @property
+    def first(self) -> dict[str, float]:
+        """The probabilities in the first search by the hypotheses' names."""
+        return dict(zip(self._trials.names, self.probabilities[0].tolist(), strict=True))
+
     def trials(self, rows: Sequence[int]) -> AssumingTrials:
         """The trials of scenes of the searches `rows`."""
         return AssumingTrials(self._trials, self.probabilities[list(rows)])
 
 
-def restored(trials: Trials | None, probabilities: Sequence[float]) -> LearnedPhysics | None:
+def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> LearnedPhysics | None:
     """What trials have learned in a single search; None if they do not learn.
 
     Args:
       trials: of the search.
-      probabilities: of the hypotheses; none if nothing was learned yet.
+      probabilities: of the hypotheses by their names; none if nothing was learned yet.
 
     Raises:
-      InputError: there are not as many as hypotheses.
+      InputError: the probabilities are impossible, or of other hypotheses than those of the trials.
     """
     if not isinstance(trials, LearnsPhysics):
+        if probabilities:
+            raise InputError(
+                "hypotheses were learned, but the trials learn nothing; give the rehearsal that it had, "
+                "such as LearningTrials(), or begin a new search"
+            )
         return None
     physics = LearnedPhysics(trials, 1)
-    if len(probabilities) not in (0, len(trials.prior)):
+    if not probabilities:
+        return physics
+    if set(probabilities) != set(trials.names):
         raise InputError(
-            f"physics: {len(probabilities)} probabilities for {len(trials.prior)} hypotheses; begin a new search"
+            f"hypotheses {'; '.join(probabilities)} were learned, but the trials have {'; '.join(trials.names)}; give "
+            "the rehearsal that it had, or begin a new search"
         )
-    if probabilities:
-        physics.probabilities[0] = probabilities
+    values = np.array([probabilities[name] for name in trials.names])
+    if not (np.isfinite(values).all() and (values >= 0.0).all() and values.sum() > 0.0):
+        raise InputError(f"probabilities {values.tolist()} of the hypotheses are impossible; begin a new search")
+    physics.probabilities[0] = values / values.sum()
     return physics
 
 

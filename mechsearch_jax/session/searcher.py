@@ -45,7 +45,7 @@ from mechsearch_jax.perception.plausibility import (
     sight_faults,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, check_images
-from mechsearch_jax.planner.learning import restored
+from mechsearch_jax.planner.learning import LearnedPhysics, restored
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
@@ -298,10 +298,8 @@ class Searcher:
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
         warnings += belief_faults(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
-        physics = restored(self._trials, now.physics)
-        if physics is not None and now.acted:
-            physics.learn_first(problem, now.belief, now.observation, now.action, observation)
-        trials = self._trials if physics is None else physics.trials([0])
+        learned = self._learned(observation)
+        trials = self._trials if learned is None else learned.trials([0])
         decision, motion = self._decide(decision_key, trials, belief, observation, depth, Present(joints, width))
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
@@ -320,9 +318,26 @@ class Searcher:
         handed = motion.trajectory is not None
         refusals = now.refusals + (not handed)
         latest = now.index, belief, observation, decision.action
-        learned = () if physics is None else tuple(physics.probabilities[0].tolist())
-        self._state = State(*latest, handed=handed, acted=False, finished=False, refusals=refusals, physics=learned)
+        self._state = State(
+            *latest,
+            handed=handed,
+            acted=False,
+            finished=False,
+            refusals=refusals,
+            hypothesis_probabilities={} if learned is None else learned.first,
+        )
         return step
+
+    def _learned(self, observation: Observation) -> LearnedPhysics | None:
+        """What trials have learned from all executed actions, with the last images; None if they do not learn.
+
+        An action that was broken off is not what is simulated, and teaches nothing.
+        """
+        now = self._now
+        learned = restored(self._trials, now.hypothesis_probabilities)
+        if learned is not None and now.acted and now.executed:
+            learned.learn_first(self.problem, now.belief, now.observation, now.action, observation)
+        return learned
 
     def _decide(
         self,
@@ -372,7 +387,8 @@ class Searcher:
         """Report that the last step's motion is over, after a failure, too: the hand may have moved something unseen.
 
         Args:
-          ok: whether it was executed to its end. A retrieval that was finishes the search.
+          ok: whether it was executed to its end. A retrieval that was finishes the search; trials that learn do so from
+            other actions that were.
 
         Raises:
           InputError: no motion was returned since the last call.
@@ -381,7 +397,8 @@ class Searcher:
         if not now.handed:
             raise InputError("acted: no motion was handed out since the last one; call next first")
         took = ok and kind_of(int(now.action.kind)).takes_target
-        self._state = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, finished=took, refusals=0)
+        over = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, executed=ok)
+        self._state = dataclasses.replace(over, finished=took, refusals=0)
 
     def save(self, path: PathLike) -> None:
         """Save the search's state as an archive of arrays, .npz, so that `load` can continue it after a crash.
@@ -397,9 +414,15 @@ class Searcher:
         The hand and the target's place may have changed.
 
         Raises:
-          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher.
+          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher, or to trials that
+            learn of other hypotheses.
         """
-        self._state = load_state(self.problem, self._digest, path)
+        state = load_state(self.problem, self._digest, path)
+        try:
+            restored(self._trials, state.hypothesis_probabilities)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        self._state = state
 
     @functools.cached_property
     def _camera_faults(self) -> tuple[str, ...]:
