@@ -10,13 +10,16 @@ import pytest
 from test_envs_simulator import pose, push, scene, standing
 
 from mechsearch_jax.actions import no_action
+from mechsearch_jax.config.presets import standard
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.slots import OneSlot
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.learning import FRICTIONS, Hypothesis, LearningTrials
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, Mismatch
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import initial_belief, search_for_grasp
@@ -253,6 +256,7 @@ def test_a_searcher_learns_from_actions_that_were_executed_to_their_end(problem,
         ({"hypotheses": (Hypothesis(0.0), Hypothesis())}, "positive numbers"),
         ({"hypotheses": (Hypothesis(), Hypothesis(weight=2.0))}, "hypotheses are equal"),
         ({"spread": 0.0}, "spread 0.0"),
+        ({"arm_stop": 0.0}, "arm_stop 0.0"),
     ],
 )
 def test_hypotheses_are_checked(wrong, message):
@@ -288,13 +292,34 @@ def test_an_arm_that_may_stop_does_as_any_other_where_it_is_not_held_up():
 def test_what_leaves_the_board_ends_nowhere(problem):
     observation = seen(problem, from_scenario(scene(EDGE)))
     row = jax.tree.map(lambda a: np.asarray(a)[None], (scenes_of(initial_belief(problem), observation), OVER))
-    ends = NativeTrials(threads=1).ends(problem, *row)[0]
+    ends = NativeTrials(threads=1).ends(problem, *row, 0.05)[0]
     assert np.isinf(ends[:, 0]).all()
 
 
 def test_trials_say_where_objects_end_if_the_arm_goes_on_and_if_it_goes_back(problem):
     observation = seen(problem, from_scenario(scene(WEDGED)))
     row = jax.tree.map(lambda a: np.asarray(a)[None], (scenes_of(initial_belief(problem), observation), SHOVE))
-    ends = NativeTrials(threads=1).ends(problem, *row)[0]
+    ends = NativeTrials(threads=1).ends(problem, *row, 0.05)[0]
     assert ends.shape == (2, observation.objects.capacity, 3)
     assert np.abs(ends[0, 0] - ends[1, 0]).max() > 1e-3
+
+
+def test_predictions_stop_where_the_arm_does(problem):
+    """With a bound that the arm does not reach both ways are the same, with a smaller one the box stays behind."""
+    observation = seen(problem, from_scenario(scene(WEDGED)))
+    row = jax.tree.map(lambda a: np.asarray(a)[None], (scenes_of(initial_belief(problem), observation), SHOVE))
+    trials = NativeTrials(threads=1)
+    never, early = (trials.ends(problem, *row, bound)[0] for bound in (10.0, 0.03))
+    np.testing.assert_array_equal(never[0], never[1])
+    np.testing.assert_array_equal(never[0], early[0])
+    assert np.abs(early[0, 0] - early[1, 0]).max() > 1e-3
+
+
+def test_episodes_of_an_arm_that_stops_learn_with_its_bound():
+    stops, usual = (
+        Method(config=standard(rehearsal="learning"), mismatch=Mismatch(arm_stop=bound)) for bound in (0.03, 0.0)
+    )
+    assert stops.trials().arm_stop == 0.03
+    assert usual.trials().arm_stop == SimulatorConfig().tracking_bound
+    assert stops.mould() != usual.mould()
+    assert Method(mismatch=Mismatch(arm_stop=0.03)).mould() == Method().mould()

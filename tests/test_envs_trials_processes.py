@@ -73,18 +73,18 @@ def test_of_a_scene_that_ends_its_process_nothing_is_known(problem, rows):
 def test_a_scene_that_ends_its_process_does_not_keep_the_others_from_ending(problem, rows):
     @dataclasses.dataclass(frozen=True)
     class Deadly(NativeTrials):
-        def ends_in_cell(self, cell, scenes, actions):
+        def ends_in_cell(self, cell, scenes, actions, arm_stop):
             if scenes.found[0]:
                 os._exit(1)
-            return NativeTrials.ends_in_cell(self, cell, scenes, actions)
+            return NativeTrials.ends_in_cell(self, cell, scenes, actions, arm_stop)
 
     scenes, actions, _ = rows
     aside = jax.tree.map(lambda a: np.asarray(a)[:, 2], actions)
-    expected = MODEL.ends(problem, scenes, aside)
+    expected = MODEL.ends(problem, scenes, aside, 0.05)
     trials = ProcessTrials(Deadly(), processes=2)
     try:
         with pytest.warns(UserWarning, match="a process died as it simulated an action"):
-            ends = trials.ends(problem, scenes, aside)
+            ends = trials.ends(problem, scenes, aside, 0.05)
     finally:
         trials.close()
     assert np.isfinite(expected[0][:, :2]).all()

@@ -97,7 +97,7 @@ class Batches:
         jobs: Sequence[Job],
         begin: Callable[[Job], bool],
         failures: _Failures,
-        trying: Callable[[str], Trials | None],
+        trying: Callable[[str, float], Trials | None],
     ) -> None:
         # What is compiled for one group serves the next.
         simulators: dict[tuple[EngineName, Workcell], Simulator] = {}
@@ -113,7 +113,7 @@ class Batches:
             while batches:
                 batch = batches.pop()
                 try:
-                    trials = trying(method.config.rehearsal)
+                    trials = trying(*method.rehearsal)
                     self._run(batch, failures.ended, _Means(target, method, simulator, worlds, trials))
                 except InputError:
                     raise
@@ -160,9 +160,9 @@ class Batches:
         )
 
 
-def _trials(stack: contextlib.ExitStack, name: str) -> Trials | None:
-    """What tries actions out by name, in processes of its own beside a GPU; ended with the stack."""
-    trials = rehearsal(name)
+def _trials(stack: contextlib.ExitStack, name: str, arm_stop: float = 0.0) -> Trials | None:
+    """What tries actions out, as `rehearsal`, in processes of its own beside a GPU; ended with the stack."""
+    trials = rehearsal(name, arm_stop)
     native = trials.trials if isinstance(trials, LearningTrials) else trials
     if jax.default_backend() == "cpu" or not isinstance(native, NativeTrials):
         return trials

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Problem
@@ -22,7 +23,9 @@ from mechsearch_jax.session.preparing import Program
 class PredictsEnds(Trials, Protocol):
     """`Trials` that also say where objects come to rest: `NativeTrials`, `ProcessTrials`."""
 
-    def ends(self, problem: Problem, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+    def ends(
+        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
         """See `NativeTrials.ends`."""
         ...
 
@@ -68,6 +71,7 @@ class LearningTrials:
       trials: in which actions are tried, and which say where objects come to rest.
       hypotheses: two or more.
       spread: scale of the distance between where an object is predicted and where it is seen [m].
+      arm_stop: error of a joint at which the robot's controller may stop the arm and bring it back [rad].
 
     Raises:
       InputError: there are too few hypotheses, two are equal, or a number is not positive.
@@ -76,6 +80,7 @@ class LearningTrials:
     trials: PredictsEnds = dataclasses.field(default_factory=NativeTrials)
     hypotheses: tuple[Hypothesis, ...] = FRICTIONS
     spread: float = 0.006
+    arm_stop: float = SimulatorConfig().tracking_bound
 
     def __post_init__(self) -> None:
         if len(self.hypotheses) < 2:
@@ -85,8 +90,9 @@ class LearningTrials:
                 raise InputError(f"LearningTrials: {hypothesis} must have positive numbers only")
         if len(set(self.names)) < len(self.names):
             raise InputError(f"LearningTrials: hypotheses are equal: {'; '.join(self.names)}; give each once")
-        if not 0.0 < self.spread < np.inf:
-            raise InputError(f"LearningTrials: spread {self.spread} must be a positive number")
+        for name in ("spread", "arm_stop"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"LearningTrials: {name} {getattr(self, name)} must be a positive number")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,7 +134,8 @@ class LearningTrials:
         if not len(acted):
             return updated
         before, executed = jax.tree.map(lambda a: np.repeat(np.asarray(a)[acted], count, axis=0), (scenes, actions))
-        ends = self.trials.ends(problem, _under([*self.hypotheses] * len(acted), before), executed)
+        under = _under([*self.hypotheses] * len(acted), before)
+        ends = self.trials.ends(problem, under, executed, self.arm_stop)
         for row, predicted in zip(acted.tolist(), np.split(ends, len(acted)), strict=True):
             there, visible = np.asarray(scenes.objects.valid)[row], np.asarray(seen.valid)[row]
             places = np.asarray(seen.position)[row]

@@ -9,11 +9,12 @@ from mechsearch_jax.runtime.errors import InputError
 
 
 @functools.cache
-def rehearsal(name: str) -> Trials | None:
-    """The `Trials` of a name; the same object for the same name.
+def rehearsal(name: str, arm_stop: float = 0.0) -> Trials | None:
+    """The `Trials` of a name; the same object for the same arguments.
 
     Args:
       name: "physics" for a simulation, "learning" for one that learns the friction as the search goes, "none" for None.
+      arm_stop: error of a joint at which the robot's controller stops the arm [rad], for "learning"; 0 if it has none.
 
     Raises:
       InputError: there is no rehearsal of that name.
@@ -26,4 +27,6 @@ def rehearsal(name: str) -> Trials | None:
     from mechsearch_jax.envs.trials.learning import LearningTrials
     from mechsearch_jax.envs.trials.native import NativeTrials
 
-    return LearningTrials() if name == "learning" else NativeTrials()
+    if name == "physics":
+        return NativeTrials()
+    return LearningTrials(arm_stop=arm_stop) if arm_stop else LearningTrials()

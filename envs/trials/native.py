@@ -120,7 +120,9 @@ class NativeTrials:
 
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
 
-    def ends(self, problem: Problem, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+    def ends(
+        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
         """Where the objects' centres come to rest after an action in each scene [m].
 
         Objects off the board are infinitely far; all is NaN where the action cannot be simulated.
@@ -130,10 +132,13 @@ class NativeTrials:
           problem: constants of the search.
           scenes: R scenes.
           actions: one for each, of a kind that moves the arm.
+          arm_stop: error of a joint at which the arm may stop [rad].
         """
-        return self.ends_in_cell(Cell(problem.target, problem.shelf, problem.gripper), scenes, actions)
+        return self.ends_in_cell(Cell(problem.target, problem.shelf, problem.gripper), scenes, actions, arm_stop)
 
-    def ends_in_cell(self, cell: Cell, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+    def ends_in_cell(
+        self, cell: Cell, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
         """`ends` without a problem."""
         simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
         actions, scenes = jax.device_get((actions, scenes))
@@ -150,7 +155,7 @@ class NativeTrials:
             if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
                 return nowhere
             try:
-                return scene.ends(kind, motion[0])[:, :count].astype(np.float32)
+                return scene.ends(kind, motion[0], arm_stop)[:, :count].astype(np.float32)
             except mujoco.FatalError:
                 return nowhere
 

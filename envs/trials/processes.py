@@ -68,7 +68,9 @@ class ProcessTrials:
             results[row] = result
         return results
 
-    def ends(self, problem: Problem, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "r 2 n 3"]:
+    def ends(
+        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
         """See `NativeTrials.ends`; NaN, with a warning, where the simulation ends its process."""
         cell = _cell(problem)
         scenes, actions = jax.device_get((scenes, actions))
@@ -76,7 +78,7 @@ class ProcessTrials:
 
         def begin(row: int) -> Future[Float[np.ndarray, "1 2 n 3"]]:
             single = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions))
-            return self._workers().submit(_ends, self.trials, cell, *single)
+            return self._workers().submit(_ends, self.trials, cell, *single, arm_stop)
 
         return np.concatenate(self._each(begin, range(len(scenes.found)), "simulated an action", nowhere))
 
@@ -174,6 +176,8 @@ def _row(
     return trials.in_cell(cell, scenes, actions, wanted)[0]
 
 
-def _ends(trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action) -> Float[np.ndarray, "1 2 n 3"]:
+def _ends(
+    trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action, arm_stop: float
+) -> Float[np.ndarray, "1 2 n 3"]:
     """Where the objects of a single scene come to rest."""
-    return trials.ends_in_cell(cell, scenes, actions)
+    return trials.ends_in_cell(cell, scenes, actions, arm_stop)
