@@ -7,15 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_envs_simulator import pose, push, scene, standing
+from test_envs_simulator import pick_and_place, pose, push, scene, standing
 
-from mechsearch_jax.actions import no_action
+from mechsearch_jax.actions import ActionKind, kind_of, no_action
+from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.slots import OneSlot
+from mechsearch_jax.envs.simulators import native_world
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
-from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls
 from mechsearch_jax.envs.trials.learning import FRICTIONS, Hypothesis, LearningTrials
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
@@ -275,6 +277,26 @@ def test_an_arm_that_is_held_up_may_stop_and_go_back():
     assert on.reason() == back.reason() == "the arm was held up"
     assert back.tracking_error < 0.05 < on.tracking_error
     assert not back.fallen.any()
+
+
+def test_an_arm_that_is_held_up_on_its_way_out_leaves_what_it_has_put_down(monkeypatch):
+    """It is made to believe so a moment after the hand has begun to open."""
+    simulator = NativeWorld()
+    action = pick_and_place(pose(0.496, 0.1, 0.1), pose(0.6, 0.2, 0.1))
+    reference, _ = jax.device_get(reference_motion(kind_of(ActionKind.PICK_AND_PLACE), action, simulator.config.motion))
+    late = np.arange(len(reference.q)) - int(reference.opens)
+    wrist = np.eye(7)[6] * ((late > 20) & (late < 30))[:, None]
+    commands = controls(reference)
+    monkeypatch.setattr(native_world, "reference_motion", lambda *_: (reference.replace(q=reference.q + wrist), True))
+    monkeypatch.setattr(native_world, "controls", lambda _: commands)
+    places = []
+    for arm_stop in (0.0, 0.5):
+        bottle = standing("cylinder", (0.024, 0.024, 0.067), 0.5, 0.1)
+        simulator.reset(scene(bottle), ASSUMED_CELL._replace(arm_stop=arm_stop))
+        assert simulator.execute(action).reason() == "the arm was held up"
+        places.append(np.asarray(simulator.world.position[0]))
+    assert places[0][0] > 0.58
+    assert np.abs(places[1] - places[0]).max() < 3e-3
 
 
 def test_an_arm_that_may_stop_does_as_any_other_where_it_is_not_held_up():

@@ -237,7 +237,7 @@ class NativeWorld:
         return self._run(controls(reference))
 
     def _guarded(self, reference: Reference, arm_stop: float) -> tuple[np.ndarray, bool]:
-        """As `_follow`, but an arm that is held up stops and goes back the way it came.
+        """As `_follow`, but an arm that is held up stops and goes back the way it came, or out once the hand opens.
 
         Args:
           reference: of the arm.
@@ -254,7 +254,11 @@ class NativeWorld:
             rows = slice(first, first + len(states[-1]))
             error = np.abs(states[-1][:, 1 : 1 + ARM] - np.asarray(reference.q[rows], float)).max()
             if error > arm_stop:
-                self._run(way_back(reference, rows.stop))
+                out = rows.stop >= int(reference.opens)
+                # On its way back the hand would close again on what it has put down.
+                rest = commands[rows.stop :] if out else way_back(reference, rows.stop)
+                if len(rest):
+                    self._run(np.ascontiguousarray(rest))
                 return np.concatenate(states), True
         return np.concatenate(states), False
 
