@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_envs_simulator import pick_and_place, pose, push, scene, standing
+from test_envs_trials import EDGE as EDGES
+from test_envs_trials import FIRM, LOOSE, begin, proposes, pushes, slots_of, stack
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
@@ -26,7 +28,7 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import initial_belief, search_for_grasp
 from mechsearch_jax.planner.learning import LEAST, LearnedPhysics, LearnsPhysics, posterior, restored
-from mechsearch_jax.planner.trials import scenes_of
+from mechsearch_jax.planner.trials import TrialResult, scenes_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.session.state import beginning, load_state, save_state
@@ -188,6 +190,55 @@ def test_slots_learn_between_looks_and_forget(problem):
     assert slot._physics.probabilities[0].argmax() > 2
     slot.forget(np.array([True]))
     assert slot._physics.probabilities[0] == pytest.approx(LearningTrials().prior)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spy(LearningTrials):
+    """Learns of each scene its own friction, and notes from which actions, and what trials assume."""
+
+    acts: dict[float, int] = dataclasses.field(default_factory=dict)
+    frictions: dict[float, float] = dataclasses.field(default_factory=dict)
+
+    def learned(self, problem, probabilities, scenes, actions, seen):
+        names = name_of(scenes)
+        self.acts.update(zip(names, np.asarray(actions.object).tolist(), strict=True))
+        assert names == name_of(scenes.replace(objects=seen))
+        return np.eye(len(FRICTIONS), dtype=np.float32)[[LEARNED[name] for name in names]]
+
+    def __call__(self, problem, scenes, actions, wanted):
+        self.frictions.update(zip(name_of(scenes), np.asarray(scenes.friction).tolist(), strict=True))
+        return np.full(wanted.shape, TrialResult.SUCCEEDED, np.int32)
+
+
+def name_of(scenes):
+    """What tells scenes apart: y of the first object."""
+    return [round(float(y), 3) for y in np.asarray(scenes.objects.position)[:, 0, 1]]
+
+
+# The index of the hypothesis that is learned of each scene.
+LEARNED = {0.1: 0, -0.075: 3, -0.09: 4}
+
+
+@pytest.mark.slow
+def test_each_of_many_slots_learns_from_its_own_action_and_assumes_what_it_learned(problem):
+    """Three slots, two at a time, in another order than theirs."""
+    over, _, aside = pushes()
+    rows = [(EDGES, False), (FIRM, False), (LOOSE, False)]
+    spy = Spy()
+    slots, keys = slots_of(problem, proposes(over, aside), spy, rows)
+    known = slots._state.belief
+    world = stack(*(from_scenario(begin(objects)) for objects, _ in rows))
+    slots.look(world, keys, [0, 1, 2])
+    slots.took({2: over.replace(object=jnp.int32(2)), 0: over.replace(object=jnp.int32(1))})
+    slots.look(world, keys, [2, 0, 1])
+    assert spy.acts == {0.1: 1, -0.075: 0, -0.09: 2}
+    slots._state = slots._state.replace(belief=known)
+    slots.decide(keys, [2, 0, 1])
+    expected = {name: FRICTIONS[index].friction for name, index in LEARNED.items()}
+    assert spy.frictions == pytest.approx(expected)
+    slots.forget(np.array([True, False, False]))
+    slots.decide(keys, [1, 0, 2])
+    assert spy.frictions == pytest.approx(expected | {0.1: 1.0})
 
 
 def test_only_trials_that_learn_are_asked_to():
