@@ -27,7 +27,7 @@ from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, Mismatch
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import initial_belief, search_for_grasp
-from mechsearch_jax.planner.learning import LEAST, LearnedPhysics, LearnsPhysics, posterior, restored
+from mechsearch_jax.planner.learning import LEAST, LearnedFriction, LearnsFriction, posterior, restored
 from mechsearch_jax.planner.trials import TrialResult, scenes_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import Searcher
@@ -65,12 +65,12 @@ def pushed(problem, friction):
 @pytest.mark.parametrize("friction", [1.0, 2.0])
 def test_a_push_tells_the_friction(problem, friction):
     before, after = pushed(problem, friction)
-    physics = LearnedPhysics(LearningTrials(NativeTrials(threads=1)), 1)
-    physics.learn_first(problem, initial_belief(problem), before, PUSH, after)
-    best = FRICTIONS[int(physics.probabilities[0].argmax())]
+    learned = LearnedFriction(LearningTrials(NativeTrials(threads=1)), 1)
+    learned.learn_first(problem, initial_belief(problem), before, PUSH, after)
+    best = FRICTIONS[int(learned.probabilities[0].argmax())]
     assert (best.friction > 1.0) == (friction > 1.0)
-    assert physics.probabilities[0].sum() == pytest.approx(1.0)
-    assert physics.probabilities[0].min() > 0.0
+    assert learned.probabilities[0].sum() == pytest.approx(1.0)
+    assert learned.probabilities[0].min() > 0.0
 
 
 def test_trials_assume_what_is_most_probable(problem):
@@ -83,28 +83,28 @@ def test_trials_assume_what_is_most_probable(problem):
             return np.zeros((2, 1), np.int32)
 
     spy = dataclasses.replace(model, trials=Spy())
-    physics = LearnedPhysics(spy, 2)
-    physics.probabilities[1] = [0.0, 0.0, 0.1, 0.2, 0.7]
+    learned = LearnedFriction(spy, 2)
+    learned.probabilities[1] = [0.0, 0.0, 0.1, 0.2, 0.7]
     two = jax.tree.map(lambda a: np.stack([a, a]), scenes_of(initial_belief(problem), pushed(problem, 1.0)[0]))
-    physics.trials([0, 1])(problem, two, no_action(), np.ones((2, 1), bool))
+    learned.trials([0, 1])(problem, two, no_action(), np.ones((2, 1), bool))
     assert np.asarray(assumed[0].friction).tolist() == [1.0, 2.0]
-    physics.forget(np.array([False, True]))
-    assert physics.probabilities[1] == pytest.approx(model.prior)
+    learned.forget(np.array([False, True]))
+    assert learned.probabilities[1] == pytest.approx(model.prior)
 
 
 def test_nothing_is_learned_where_nothing_was_done(problem):
     before, after = pushed(problem, 2.0)
-    physics = LearnedPhysics(LearningTrials(), 1)
-    physics.learn_first(problem, initial_belief(problem), before, no_action(), after)
-    assert physics.probabilities[0] == pytest.approx(LearningTrials().prior)
+    learned = LearnedFriction(LearningTrials(), 1)
+    learned.learn_first(problem, initial_belief(problem), before, no_action(), after)
+    assert learned.probabilities[0] == pytest.approx(LearningTrials().prior)
 
 
 def test_what_cannot_be_simulated_teaches_nothing(problem):
     before, after = pushed(problem, 2.0)
-    physics = LearnedPhysics(LearningTrials(NativeTrials(threads=1)), 1)
+    learned = LearnedFriction(LearningTrials(NativeTrials(threads=1)), 1)
     out_of_reach = PUSH.replace(T_world_gripper=pose(3.0, 0.0, 0.1))
-    physics.learn_first(problem, initial_belief(problem), before, out_of_reach, after)
-    assert physics.probabilities[0] == pytest.approx(LearningTrials().prior)
+    learned.learn_first(problem, initial_belief(problem), before, out_of_reach, after)
+    assert learned.probabilities[0] == pytest.approx(LearningTrials().prior)
 
 
 PRIOR = np.array([0.1, 0.15, 0.5, 0.15, 0.1], np.float32)
@@ -187,9 +187,9 @@ def test_slots_learn_between_looks_and_forget(problem):
     slot.look(before, keys, [0])
     slot.took({0: PUSH})
     slot.look(jax.tree.map(lambda a: a[None], simulator.world), keys, [0])
-    assert slot._physics.probabilities[0].argmax() > 2
+    assert slot._learned.probabilities[0].argmax() > 2
     slot.forget(np.array([True]))
-    assert slot._physics.probabilities[0] == pytest.approx(LearningTrials().prior)
+    assert slot._learned.probabilities[0] == pytest.approx(LearningTrials().prior)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,8 +242,8 @@ def test_each_of_many_slots_learns_from_its_own_action_and_assumes_what_it_learn
 
 
 def test_only_trials_that_learn_are_asked_to():
-    assert isinstance(rehearsal("learning"), LearnsPhysics)
-    assert not isinstance(rehearsal("physics"), LearnsPhysics)
+    assert isinstance(rehearsal("learning"), LearnsFriction)
+    assert not isinstance(rehearsal("physics"), LearnsFriction)
     assert restored(rehearsal("physics"), {}) is None
 
 

@@ -23,7 +23,7 @@ from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
-from mechsearch_jax.planner.learning import LearnedPhysics, LearnsPhysics
+from mechsearch_jax.planner.learning import LearnedFriction, LearnsFriction
 from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, scenes_of
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
@@ -89,7 +89,7 @@ class ManySlots:
         trials: what tries actions out before one is made; nothing if left out.
         """
         self._problem, self._trials = problem, trials
-        self._physics = LearnedPhysics(trials, len(world.kind)) if isinstance(trials, LearnsPhysics) else None
+        self._learned = LearnedFriction(trials, len(world.kind)) if isinstance(trials, LearnsFriction) else None
         self._policy, self._mould = as_pytree(policy), mould(policy)
         self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf)
         self._at_once = at_once
@@ -148,8 +148,8 @@ class ManySlots:
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """See `Slots`."""
         self._state = _forget(self._problem, self._state, jax.device_put(np.asarray(fresh)))
-        if self._physics is not None:
-            self._physics.forget(fresh)
+        if self._learned is not None:
+            self._learned.forget(fresh)
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`."""
@@ -178,9 +178,9 @@ class ManySlots:
             self._state = _look(
                 self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
             )
-        if self._physics is not None:
-            acted = scenes_of(before.belief, before.observation), before.action, self._state.observation.objects
-            self._physics.learn(self._problem, rows, *jax.tree.map(lambda a: a[list(rows)], jax.device_get(acted)))
+        if self._learned is not None:
+            searches = scenes_of(before.belief, before.observation), before.action, self._state.observation.objects
+            self._learned.learn(self._problem, rows, *jax.tree.map(lambda a: a[list(rows)], jax.device_get(searches)))
         return summary(self._problem, self._state.belief, self._state.truth, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
@@ -233,7 +233,7 @@ class ManySlots:
             for count, (decision, scenes) in zip(counts, proposed, strict=True)
         ]
         scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
-        trials = self._trials if self._physics is None else self._physics.trials([r for chunk in chunks for r in chunk])
+        trials = self._trials if self._learned is None else self._learned.trials([r for chunk in chunks for r in chunk])
         results = trials(self._problem, scenes, alternatives.actions, alternatives.worth)
         blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
         parts = np.split(results, np.cumsum(counts)[:-1])

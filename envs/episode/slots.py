@@ -128,7 +128,7 @@ class OneSlot:
         self.truth: Truth | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
-        self._physics = restored(trials, {})
+        self._learned = restored(trials, {})
         self._sensing: Sensing | None = None
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
@@ -136,8 +136,8 @@ class OneSlot:
         if fresh[0]:
             self.belief = initial_belief(self._problem)
             self.action, self.observation, self.truth = no_action(), None, None
-            if self._physics is not None:
-                self._physics.forget(fresh)
+            if self._learned is not None:
+                self._learned.forget(fresh)
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`; accepts any policy."""
@@ -154,8 +154,8 @@ class OneSlot:
         observation = self._recogniser(keys[0], snapshot)
         # The first look, before any action, makes the same call, so that nothing is compiled twice.
         before = observation if self.observation is None else self.observation
-        if self._physics is not None:
-            self._physics.learn_first(self._problem, self.belief, before, self.action, observation)
+        if self._learned is not None:
+            self._learned.learn_first(self._problem, self.belief, before, self.action, observation)
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
         self.action = no_action()
         truth = truth_of(self._recogniser, snapshot, observation)
@@ -169,7 +169,7 @@ class OneSlot:
         if not rows:
             return {}
         assert self.observation is not None
-        trials = self._trials if self._physics is None else self._physics.trials([0])
+        trials = self._trials if self._learned is None else self._learned.trials([0])
         self.decision = decide(self._policy, trials, keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}

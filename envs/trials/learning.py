@@ -60,7 +60,7 @@ FRICTIONS = (
 
 @dataclasses.dataclass(frozen=True)
 class LearningTrials:
-    """`Trials` that assume the most probable of some hypotheses; see `planner.learning.LearnsPhysics`.
+    """`Trials` that assume the most probable of some hypotheses; see `planner.learning.LearnsFriction`.
 
     After an action it is simulated under every hypothesis. An arm that is held up may go on or stop and go back: the
     way that fits better counts.
@@ -96,12 +96,12 @@ class LearningTrials:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """See `LearnsPhysics`."""
+        """See `LearnsFriction`."""
         return tuple(f"friction {h.friction:g}, mass {h.mass:g}" for h in self.hypotheses)
 
     @property
     def prior(self) -> Float[np.ndarray, " h"]:
-        """See `LearnsPhysics`."""
+        """See `LearnsFriction`."""
         weights = np.array([hypothesis.weight for hypothesis in self.hypotheses], np.float32)
         return weights / weights.sum()
 
@@ -116,7 +116,7 @@ class LearningTrials:
         return self.trials.programs(problem)
 
     def assumed(self, probabilities: Float[np.ndarray, "r h"], scenes: TrialScenes) -> TrialScenes:
-        """See `LearnsPhysics`."""
+        """See `LearnsFriction`."""
         return _under([self.hypotheses[i] for i in probabilities.argmax(axis=1)], scenes)
 
     def learned(
@@ -127,16 +127,16 @@ class LearningTrials:
         actions: Action,
         seen: Superquadrics,
     ) -> Float[np.ndarray, "r h"]:
-        """See `LearnsPhysics`."""
+        """See `LearnsFriction`."""
         scenes, actions, seen = jax.device_get((scenes, actions, seen))
-        acted = np.flatnonzero(np.asarray(actions.kind) != ActionKind.NONE)
+        rows = np.flatnonzero(np.asarray(actions.kind) != ActionKind.NONE)
         updated, count = probabilities.copy(), len(self.hypotheses)
-        if not len(acted):
+        if not len(rows):
             return updated
-        before, executed = jax.tree.map(lambda a: np.repeat(np.asarray(a)[acted], count, axis=0), (scenes, actions))
-        under = _under([*self.hypotheses] * len(acted), before)
+        before, executed = jax.tree.map(lambda a: np.repeat(np.asarray(a)[rows], count, axis=0), (scenes, actions))
+        under = _under([*self.hypotheses] * len(rows), before)
         ends = self.trials.ends(problem, under, executed, self.arm_stop)
-        for row, predicted in zip(acted.tolist(), np.split(ends, len(acted)), strict=True):
+        for row, predicted in zip(rows.tolist(), np.split(ends, len(rows)), strict=True):
             there, visible = np.asarray(scenes.objects.valid)[row], np.asarray(seen.valid)[row]
             places = np.asarray(seen.position)[row]
             updated[row] = posterior(probabilities[row], predicted, there, places, visible, self.spread)

@@ -36,7 +36,7 @@ LEAST = 1e-3
 
 
 @runtime_checkable
-class LearnsPhysics(Protocol):
+class LearnsFriction(Protocol):
     """`Trials` that learn friction and mass; H is the number of their hypotheses."""
 
     @property
@@ -81,14 +81,14 @@ class LearnsPhysics(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AssumingTrials:
-    """The `Trials` of scenes whose physics were learned.
+    """The `Trials` of scenes in which hypotheses were learned.
 
     Attributes:
       trials: that learn.
       probabilities: of their hypotheses in each scene.
     """
 
-    trials: LearnsPhysics
+    trials: LearnsFriction
     probabilities: Float[np.ndarray, "r h"]
 
     def __call__(
@@ -98,14 +98,14 @@ class AssumingTrials:
         return self.trials(problem, self.trials.assumed(self.probabilities, scenes), actions, wanted)
 
 
-class LearnedPhysics:
+class LearnedFriction:
     """What trials have learned in several searches.
 
     Attributes:
       probabilities: of the hypotheses in each search, shape (S, H).
     """
 
-    def __init__(self, trials: LearnsPhysics, searches: int) -> None:
+    def __init__(self, trials: LearnsFriction, searches: int) -> None:
         """Nothing is learned yet in so many searches."""
         self._trials = trials
         self.probabilities = np.tile(trials.prior, (searches, 1))
@@ -117,16 +117,16 @@ class LearnedPhysics:
     def learn(
         self, problem: Problem, rows: Sequence[int], scenes: TrialScenes, actions: Action, seen: Superquadrics
     ) -> None:
-        """Learn in the searches `rows`; the other arguments as of `LearnsPhysics.learned`."""
-        here = self.probabilities[list(rows)]
-        self.probabilities[list(rows)] = self._trials.learned(problem, here, scenes, actions, seen)
+        """Learn in the searches `rows`; the other arguments as of `LearnsFriction.learned`."""
+        before = self.probabilities[list(rows)]
+        self.probabilities[list(rows)] = self._trials.learned(problem, before, scenes, actions, seen)
 
     def learn_first(
         self, problem: Problem, belief: Belief, before: Observation, action: Action, after: Observation
     ) -> None:
         """Learn in the first search from an action, and from the belief and the observations before and after it."""
-        acted = scenes_of(belief, before), action, after.objects
-        self.learn(problem, [0], *jax.tree.map(lambda a: np.asarray(a)[None], acted))
+        search = scenes_of(belief, before), action, after.objects
+        self.learn(problem, [0], *jax.tree.map(lambda a: np.asarray(a)[None], search))
 
     @property
     def first(self) -> dict[str, float]:
@@ -138,7 +138,7 @@ class LearnedPhysics:
         return AssumingTrials(self._trials, self.probabilities[list(rows)])
 
 
-def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> LearnedPhysics | None:
+def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> LearnedFriction | None:
     """What trials have learned in a single search; None if they do not learn.
 
     Args:
@@ -148,16 +148,16 @@ def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> Learn
     Raises:
       InputError: the probabilities are impossible, or of other hypotheses than those of the trials.
     """
-    if not isinstance(trials, LearnsPhysics):
+    if not isinstance(trials, LearnsFriction):
         if probabilities:
             raise InputError(
                 "hypotheses were learned, but the trials learn nothing; give the rehearsal that it had, "
                 "such as LearningTrials(), or begin a new search"
             )
         return None
-    physics = LearnedPhysics(trials, 1)
+    learned = LearnedFriction(trials, 1)
     if not probabilities:
-        return physics
+        return learned
     if set(probabilities) != set(trials.names):
         raise InputError(
             f"hypotheses {'; '.join(probabilities)} were learned, but the trials have {'; '.join(trials.names)}; give "
@@ -166,8 +166,8 @@ def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> Learn
     values = np.array([probabilities[name] for name in trials.names])
     if not (np.isfinite(values).all() and (values >= 0.0).all() and values.sum() > 0.0):
         raise InputError(f"probabilities {values.tolist()} of the hypotheses are impossible; begin a new search")
-    physics.probabilities[0] = values / values.sum()
-    return physics
+    learned.probabilities[0] = values / values.sum()
+    return learned
 
 
 def posterior(

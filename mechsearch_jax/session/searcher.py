@@ -45,7 +45,7 @@ from mechsearch_jax.perception.plausibility import (
     sight_faults,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, check_images
-from mechsearch_jax.planner.learning import LearnedPhysics, restored
+from mechsearch_jax.planner.learning import LearnedFriction, restored
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
@@ -328,7 +328,7 @@ class Searcher:
         )
         return step
 
-    def _learned(self, observation: Observation) -> LearnedPhysics | None:
+    def _learned(self, observation: Observation) -> LearnedFriction | None:
         """What trials have learned from all executed actions, with the last images; None if they do not learn.
 
         An action that was broken off is not what is simulated, and teaches nothing.

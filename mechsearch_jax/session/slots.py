@@ -6,7 +6,7 @@ from typing import Any
 
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.dynamics.named import own_push_model
-from mechsearch_jax.planner.learning import LearnsPhysics
+from mechsearch_jax.planner.learning import LearnsFriction
 from mechsearch_jax.planner.policies import PlanningPolicy, Policy, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
@@ -32,7 +32,7 @@ def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: 
         given.
     """
     given = [name for name, value in slots.items() if value is not None]
-    if config.rehearsal == "learning" and trials is not None and not isinstance(trials, LearnsPhysics):
+    if config.rehearsal == "learning" and trials is not None and not isinstance(trials, LearnsFriction):
         raise InputError(
             'Searcher: config names the rehearsal "learning", and one that learns nothing is given; give '
             'rehearsal=LearningTrials() (envs.trials.learning), or a config with rehearsal="physics"'

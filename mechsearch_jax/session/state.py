@@ -41,7 +41,7 @@ class State:
       refusals: number of steps without a motion since the last action.
       executed: whether that action was executed to its end.
       hypothesis_probabilities: what trials that learn hold of each hypothesis by its name, see
-        `planner.learning.LearnsPhysics`; empty if they do not learn, or have not yet.
+        `planner.learning.LearnsFriction`; empty if they do not learn, or have not yet.
     """
 
     index: int
