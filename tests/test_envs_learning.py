@@ -141,10 +141,11 @@ def test_what_fits_is_evidence_for_what_was_assumed():
 
 
 def test_an_object_that_is_not_seen_does_not_decide_alone():
-    """Whatever else is nearest to where hypotheses have it come to rest."""
+    """Whatever else is nearest to where hypotheses have it come to rest, also if that has just come into sight."""
     predicted = np.zeros((5, 2, 3))
     predicted[:, 1, 0] = 0.1, 0.1, 0.1, 0.065, 0.06
-    assert after_one(predicted, [[0.0, 0.0, 0.0]]) == pytest.approx(PRIOR)
+    for others in ([], [[0.15, 0.0, 0.0]]):
+        assert after_one(predicted, [[0.0, 0.0, 0.0], *others]) == pytest.approx(PRIOR)
 
 
 def test_two_objects_are_not_seen_in_one():
