@@ -290,14 +290,10 @@ class Searcher:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
         width = None if width is None else checked_width(width, problem.gripper.max_opening)
-        misplaced = self._placement_faults(depth)
-        observation = self.recogniser(recognition_key, depth, colour, mask, target_id).judged()
-        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
-        unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
-        warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
+        observation, warnings, shelf_is_empty = self._seen(recognition_key, depth, colour, mask, target_id)
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        warnings += belief_faults(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
+        warnings += belief_faults(now.belief, belief, shelf_is_empty=shelf_is_empty)
         learned = self._learned(observation)
         trials = self._trials if learned is None else learned.trials([0])
         decision, motion = self._decide(decision_key, trials, belief, observation, depth, Present(joints, width))
@@ -327,6 +323,22 @@ class Searcher:
             hypothesis_probabilities={} if learned is None else learned.first,
         )
         return step
+
+    def _seen(
+        self, key: Array, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None
+    ) -> tuple[Observation, list[str], bool]:
+        """What is recognised in images, warnings about them, and whether they show an empty shelf.
+
+        Raises:
+          InputError: as `next`.
+        """
+        problem = self.problem
+        misplaced = self._placement_faults(depth)
+        observation = self.recogniser(key, depth, colour, mask, target_id).judged()
+        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
+        unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
+        warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
+        return observation, warnings, EMPTY_SHELF in unseen
 
     def _learned(self, observation: Observation) -> LearnedFriction | None:
         """What trials have learned from all executed actions, with the last images; None if they do not learn.
