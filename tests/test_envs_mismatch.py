@@ -227,6 +227,9 @@ def test_what_cannot_be_simulated_is_refused():
     with pytest.raises(InputError, match="add --simulator native"):
         Method(engine="MjxSimulator", mismatch=Mismatch(physics="fine-step")).check()
     Method(mismatch=Mismatch(physics="fine-step")).check()
+    with pytest.raises(InputError, match=r"--arm-stop: .* add --simulator native"):
+        Method(engine="MjxSimulator", mismatch=Mismatch(arm_stop=0.04)).check()
+    Method(mismatch=Mismatch(arm_stop=0.04)).check()
     numbers = Mismatch(friction=2.0, mass=2.0, shelf_shift=0.01, shelf_turn=1.0, camera_shift=0.01)
     Method(engine="MjxSimulator", mismatch=numbers).check()
     for colours in (

@@ -253,6 +253,8 @@ def test_every_world_has_its_own_cell(sim):
         np.testing.assert_array_equal(field[1:3], field[:1].repeat(2, axis=0))
     with pytest.raises(InputError, match="usual physics"):
         sim.set_cells({0: ActualCell(physics="fine-step")})
+    with pytest.raises(InputError, match="the arm never stops"):
+        sim.set_cells({0: ActualCell(arm_stop=0.04)})
 
 
 @pytest.mark.slow

@@ -100,7 +100,8 @@ def test_a_robot_that_stands_elsewhere_sees_camera_and_shelf_from_there(tmp_path
 
 
 def test_the_targets_place_is_in_the_frame_of_the_shelf_but_joint_angles_are_not(tmp_path):
-    base = "[base]\nposition = [5, -0.25, 0.125]\n[arm]\nplace = "
+    shelf = "[shelf]\nfront = 5.414\nback = 5.788\nspawn_x = [5.45, 5.73]\n"
+    base = f"{shelf}[base]\nposition = [5, -0.25, 0.125]\n[arm]\nplace = "
     assert load(tmp_path, base + "[5.4, -0.5, 0.2]").workcell.arm.place == (0.4, -0.25, 0.075)
     angles = Workcell().arm.home
     assert load(tmp_path, base + str(list(angles))).workcell.arm.place == angles
@@ -148,6 +149,8 @@ WRONG = {
     "[camera]\nfx = 1" + "0" * 400: ":2: [camera] fx must be a number that is finite",
     "[shelf]\nfront = 0.5\nback = 0.4": ":2: [shelf] front (0.5) must be below back (0.4)",
     "[shelf]\nfront = 1.0\nback = 1.4\nthickness = 0": ":4: [shelf] thickness (0.0) must be from",
+    "[shelf]\nfront = 0.374": ": [gripper]: outside (0.26, 0.3, 0.34, 0.374) must lie in front of the shelf, at 0.334",
+    "[gripper]\noutside = [0.26, 0.39]": ":1: [gripper]: outside (0.26, 0.39) must lie in front of the shelf, at 0.374",
     "[shelves]\nfront = 0.5": ":1: [shelves] is unknown; did you mean shelf?",
     "# mine\nfront = 0.5": ":2: front stands in no table; begin one of [camera], [shelf]",
     '[target]\nshape = "ball"': ':2: [target] shape: "ball" is unknown',

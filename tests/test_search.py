@@ -21,6 +21,7 @@ from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.cell.loading import load_searcher
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
+from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
@@ -259,6 +260,12 @@ def test_what_a_policy_does_not_propose_cannot_be_tried(problem):
 def test_an_option_that_would_have_no_effect_is_refused():
     with pytest.raises(InputError, match=r'config names the rehearsal "physics", and none is given.*load_searcher'):
         Searcher(config=standard())
+    with pytest.raises(InputError, match=r'rehearsal "learning", and none is given.*rehearsal=LearningTrials\(\)'):
+        Searcher(config=standard(rehearsal="learning"))
+    for policy in (None, search_for_grasp(tries=True)):
+        with pytest.raises(InputError, match=r"one that learns nothing is given; give rehearsal=LearningTrials\(\)"):
+            Searcher(config=standard(rehearsal="learning"), rehearsal=NativeTrials(), policy=policy)
+    Searcher(config=standard(rehearsal="learning"), rehearsal=LearningTrials())
     with pytest.raises(InputError, match='config names the push model "physics"'):
         Searcher(config=standard(rehearsal="none", push_model="physics"))
     with pytest.raises(InputError, match='config names the push model "quasi-static", and another is given'):

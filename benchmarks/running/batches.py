@@ -18,6 +18,7 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.simulators.named import EngineName, new_simulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
@@ -96,7 +97,7 @@ class Batches:
         jobs: Sequence[Job],
         begin: Callable[[Job], bool],
         failures: _Failures,
-        trying: Callable[[str], Trials | None],
+        trying: Callable[[str, float], Trials | None],
     ) -> None:
         # What is compiled for one group serves the next.
         simulators: dict[tuple[EngineName, Workcell], Simulator] = {}
@@ -112,7 +113,7 @@ class Batches:
             while batches:
                 batch = batches.pop()
                 try:
-                    trials = trying(method.config.rehearsal)
+                    trials = trying(*method.rehearsal)
                     self._run(batch, failures.ended, _Means(target, method, simulator, worlds, trials))
                 except InputError:
                     raise
@@ -159,14 +160,15 @@ class Batches:
         )
 
 
-def _trials(stack: contextlib.ExitStack, name: str) -> Trials | None:
-    """What tries actions out by name, in processes of its own beside a GPU; ended with the stack."""
-    trials = rehearsal(name)
-    if jax.default_backend() == "cpu" or not isinstance(trials, NativeTrials):
+def _trials(stack: contextlib.ExitStack, name: str, arm_stop: float = 0.0) -> Trials | None:
+    """What tries actions out, as `rehearsal`, in processes of its own beside a GPU; ended with the stack."""
+    trials = rehearsal(name, arm_stop)
+    native = trials.trials if isinstance(trials, LearningTrials) else trials
+    if jax.default_backend() == "cpu" or not isinstance(native, NativeTrials):
         return trials
-    apart = ProcessTrials(trials)
+    apart = ProcessTrials(native)
     stack.callback(apart.close)
-    return apart
+    return dataclasses.replace(trials, trials=apart) if isinstance(trials, LearningTrials) else apart
 
 
 class _Batch:

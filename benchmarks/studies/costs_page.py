@@ -15,7 +15,7 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, PaperTable
-from mechsearch_jax.benchmarks.parts.scaling import read_measured
+from mechsearch_jax.benchmarks.parts.scaling import Measured, read_measured
 from mechsearch_jax.benchmarks.report.results_page import Stored, table
 from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, StoredSeconds, nearest, stored_seconds
 from mechsearch_jax.benchmarks.studies.declared import GROUPS
@@ -34,6 +34,8 @@ STRICT: tuple[ProtocolName, ...] = ("strict",)
 # Of a table that is run by more than the strict protocol.
 PROTOCOLS: Mapping[str, tuple[ProtocolName, ...]] = {"table1": ("strict", "published-code")}
 # The seeds of Table 1 beside the first, of one variant.
+# How rates of episodes grow, in the folder of results.
+SCALING = "scaling-h200.jsonl"
 MORE_SEEDS = 3
 # On a GPU; protocol published-code tries one action after the other, which takes no batches.
 ENGINES: Mapping[ProtocolName, EngineName] = {"strict": "MjxSimulator", "published-code": "NativeSimulator"}
@@ -171,6 +173,18 @@ def _file(source: str) -> str:
     return f"../{path.with_suffix('.jsonl') if path.suffix == '.parquet' else path}"
 
 
+def scaling(measured: Sequence[Measured]) -> str:
+    """How many episodes a second several GPUs or CPU workers ran, and how many times those of a single one."""
+    single = {each.device: each.rate for each in measured if each.workers == 1}
+    names = {"shards": "GPUs with a process each", "ray": "GPUs by Ray", "workers": "CPU workers with a core each"}
+    several = (
+        f"{each.workers} {names[each.case]} {each.rate:.2f}, {each.rate / single[each.device]:.2f} times a single one"
+        for each in measured
+        if each.workers > 1
+    )
+    return "; ".join(several)
+
+
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template."""
     measures, parts = Measures.of(stored), experiments()
@@ -189,6 +203,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "cores": sum(part.count for part in parts) * measures.cpu / HOUR / 64,
         "report": reports["report"],
         "rows": stored["report-cpu"]["rows"],
+        "scaling": scaling(read_measured(stored.folder / SCALING)),
     }
 
 

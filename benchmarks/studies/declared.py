@@ -1,7 +1,7 @@
 """The studies that there are.
 
-Ablations run on `development`, since they choose what is left out of the default; baselines and robustness on scenes
-that nothing was chosen on.
+Ablations run on `development`, since they choose what the default has; baselines and robustness on scenes that nothing
+was chosen on.
 """
 
 from __future__ import annotations
@@ -148,6 +148,16 @@ _ABLATIONS = (
             Variant("masks, 5 mm", {"recognition": "masks", "mismatch": Mismatch(depth_noise=0.005)}),
             Variant("full, 2 mm", {"recognition": "full", "mismatch": Mismatch(depth_noise=0.002)}),
             Variant("full, 5 mm", {"recognition": "full", "mismatch": Mismatch(depth_noise=0.005)}),
+        ),
+    ),
+    Study(
+        "friction-learned",
+        "What does it gain to learn the friction while searching, where it is and is not as assumed?",
+        ABLATION_SCENES,
+        tuple(
+            Variant(f"friction x {factor:g}, {label}", {"rehearsal": name, "mismatch": Mismatch(friction=factor)})
+            for factor in (1.0, 0.5, 1.4, 2.0)
+            for label, name in (("assumed", "physics"), ("learned", "learning"))
         ),
     ),
 )

@@ -34,7 +34,7 @@ INTRODUCTION = (
     "95% intervals, which know that the seeds of a scene are alike; each is for itself: where there is no difference "
     "at all, one in twenty shows one. A change is a paired difference from the first variant, over the scenes and "
     "seeds that both have: of shares in percentage points, of actions in actions. The simulator that tries actions out "
-    "is the one that judges them, but for the studies under Robustness.",
+    "is the one that judges them, but for the studies under Robustness and `friction-learned`.",
 )
 
 

@@ -23,6 +23,7 @@ from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner.learning import LearnedFriction, LearnsFriction
 from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, scenes_of
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
@@ -88,6 +89,7 @@ class ManySlots:
         trials: what tries actions out before one is made; nothing if left out.
         """
         self._problem, self._trials = problem, trials
+        self._learned = LearnedFriction(trials, len(world.kind)) if isinstance(trials, LearnsFriction) else None
         self._policy, self._mould = as_pytree(policy), mould(policy)
         self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf)
         self._at_once = at_once
@@ -146,6 +148,8 @@ class ManySlots:
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """See `Slots`."""
         self._state = _forget(self._problem, self._state, jax.device_put(np.asarray(fresh)))
+        if self._learned is not None:
+            self._learned.forget(fresh)
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`."""
@@ -169,10 +173,14 @@ class ManySlots:
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
+        before = self._state
         for _, padded in self._chunks(rows):
             self._state = _look(
                 self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
             )
+        if self._learned is not None:
+            searches = scenes_of(before.belief, before.observation), before.action, self._state.observation.objects
+            self._learned.learn(self._problem, rows, *jax.tree.map(lambda a: a[list(rows)], jax.device_get(searches)))
         return summary(self._problem, self._state.belief, self._state.truth, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
@@ -200,7 +208,7 @@ class ManySlots:
             proposed.append(_propose(self._policy, own, self._problem, self._state, keys, padded, question))
         choices: dict[int, Choice] = {}
         for (chunk, padded), (decision, _), results in zip(
-            chunks, proposed, self._tried([len(chunk) for chunk, _ in chunks], proposed), strict=True
+            chunks, proposed, self._tried([chunk for chunk, _ in chunks], proposed), strict=True
         ):
             decided = _choose(decision, results)
             self._state = _note(self._state, decided.action, padded)
@@ -209,22 +217,24 @@ class ManySlots:
         return choices
 
     def _tried(
-        self, counts: Sequence[int], proposed: Sequence[tuple[Decision, TrialScenes]]
+        self, chunks: Sequence[Sequence[int]], proposed: Sequence[tuple[Decision, TrialScenes]]
     ) -> Sequence[Int[np.ndarray, "n k"] | None]:
         """What becomes of the alternatives of decisions in chunks of slots; None where nothing is tried.
 
         Args:
-          counts: how many rows of each chunk there are; the others are beyond the end.
+          chunks: the slots of each chunk; further rows are beyond the end.
           proposed: decisions and scenes of each chunk.
         """
         if self._trials is None or any(decision.alternatives is None for decision, _ in proposed) or not proposed:
             return [None] * len(proposed)
+        counts = [len(chunk) for chunk in chunks]
         rows = [
             jax.tree.map(lambda a, count=count: a[:count], jax.device_get((scenes, decision.alternatives)))
             for count, (decision, scenes) in zip(counts, proposed, strict=True)
         ]
         scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
-        results = self._trials(self._problem, scenes, alternatives.actions, alternatives.worth)
+        trials = self._trials if self._learned is None else self._learned.trials([r for chunk in chunks for r in chunk])
+        results = trials(self._problem, scenes, alternatives.actions, alternatives.worth)
         blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
         parts = np.split(results, np.cumsum(counts)[:-1])
         return [np.concatenate([part, blank[len(part) :]]).astype(np.int32) for part in parts]

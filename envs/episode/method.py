@@ -70,7 +70,12 @@ class Method:
 
     def trials(self) -> Trials | None:
         """The trials of the policy's best actions; None without a rehearsal."""
-        return rehearsal(self.config.rehearsal)
+        return rehearsal(*self.rehearsal)
+
+    @property
+    def rehearsal(self) -> tuple[str, float]:
+        """The arguments of `trials.named.rehearsal`: its name, and for one that learns where the arm stops [rad]."""
+        return self.config.rehearsal, self.mismatch.arm_stop if self.config.rehearsal == "learning" else 0.0
 
     def recogniser(self, target: Target) -> Recogniser:
         """The recogniser of its episodes with a target.
@@ -100,7 +105,7 @@ class Method:
           InputError: as `policy`.
         """
         shared = self.workcell, self.config.problem, self.recognition, self.engine, self.protocol
-        return *shared, self.config.rehearsal, self.mismatch.mould(), mould(self.policy())
+        return *shared, self.rehearsal, self.mismatch.mould(), mould(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.

@@ -75,7 +75,7 @@ class Step:
       restarts: how often f has become empty and was started anew.
       fallen: indices in the scenario of the objects that left the board in this step.
       target_fallen: whether the target did; False while it is in the hand.
-      held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`.
+      held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`, and `Mismatch.arm_stop`.
       at_rest: whether everything came to rest after the action; False also where the simulation diverged.
       tracking_error: largest distance of a joint from its reference [rad].
       paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.

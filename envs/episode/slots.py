@@ -25,6 +25,7 @@ from mechsearch_jax.envs.episode.verdicts import Verdict, judge, swept_free
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner.learning import restored
 from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.runtime.compiled import kept
 
@@ -127,6 +128,7 @@ class OneSlot:
         self.truth: Truth | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
+        self._learned = restored(trials, {})
         self._sensing: Sensing | None = None
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
@@ -134,6 +136,8 @@ class OneSlot:
         if fresh[0]:
             self.belief = initial_belief(self._problem)
             self.action, self.observation, self.truth = no_action(), None, None
+            if self._learned is not None:
+                self._learned.forget(fresh)
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`; accepts any policy."""
@@ -150,6 +154,8 @@ class OneSlot:
         observation = self._recogniser(keys[0], snapshot)
         # The first look, before any action, makes the same call, so that nothing is compiled twice.
         before = observation if self.observation is None else self.observation
+        if self._learned is not None:
+            self._learned.learn_first(self._problem, self.belief, before, self.action, observation)
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
         self.action = no_action()
         truth = truth_of(self._recogniser, snapshot, observation)
@@ -163,7 +169,8 @@ class OneSlot:
         if not rows:
             return {}
         assert self.observation is not None
-        self.decision = decide(self._policy, self._trials, keys[0], self._problem, self.belief, self.observation)
+        trials = self._trials if self._learned is None else self._learned.trials([0])
+        self.decision = decide(self._policy, trials, keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
 

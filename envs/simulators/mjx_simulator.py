@@ -130,10 +130,12 @@ class MjxSimulator:
         """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`.
 
         Raises:
-          InputError: one of them has other physics.
+          InputError: one of them has other physics, or an arm that stops.
         """
         if any(cell.physics != ASSUMED_CELL.physics for cell in cells.values()):
             raise InputError("MjxSimulator: all worlds have the usual physics; use the NativeSimulator")
+        if any(cell.arm_stop for cell in cells.values()):
+            raise InputError("MjxSimulator: the arm never stops (arm_stop); use the NativeSimulator")
         self._next_cells.update(cells)
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:

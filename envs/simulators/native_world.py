@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from mechsearch_jax.actions import Action, Kind, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.simulators.physics import PHYSICS
-from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls, resampled
+from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls, resampled, way_back
 from mechsearch_jax.envs.simulators.trace import Recorder, Trace
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
@@ -34,6 +34,9 @@ from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
+
+# Time steps between two looks at the error of an arm that may stop.
+GUARD_BLOCK = 5
 
 
 class NativeWorld:
@@ -199,14 +202,16 @@ class NativeWorld:
         """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""
         # The blank model's step has as many digits as MuJoCo was given, and is the usual one.
         reference = resampled(reference, self._blank.opt.timestep, self._model.opt.timestep)
-        states = self._follow(reference)
+        stop = self._cell.arm_stop
+        states, stopped = self._guarded(reference, stop) if stop else (self._follow(reference), False)
         error = self._tracking_error(states, reference)
-        dropped = kind.holds_object and not self._slip(states, reference, index) < self.config.slip
-        if kind.returns_home:
+        held_up = stopped or error > self.config.tracking_bound
+        dropped = not held_up and kind.holds_object and not self._slip(states, reference, index) < self.config.slip
+        if kind.returns_home or stopped:
             self._go_home()
         settled = self._come_to_rest()
         failure = Failure.DROPPED if dropped else Failure.NONE
-        return Failure.HELD_UP if error > self.config.tracking_bound else failure, error, settled
+        return Failure.HELD_UP if held_up else failure, error, settled
 
     def _begin(self, bodies: list[Body | None], world: World) -> World:
         self.place(bodies, self._cell)
@@ -230,6 +235,32 @@ class NativeWorld:
         start = np.asarray(reference.start, float)
         self._set_robot(start[:ARM], float(start[ARM]))
         return self._run(controls(reference))
+
+    def _guarded(self, reference: Reference, arm_stop: float) -> tuple[np.ndarray, bool]:
+        """As `_follow`, but an arm that is held up stops and goes back the way it came, or out once the hand opens.
+
+        Args:
+          reference: of the arm.
+          arm_stop: error of a joint at which it stops [rad].
+
+        Returns:
+          The states until it stops, and whether it did.
+        """
+        start, commands = np.asarray(reference.start, float), controls(reference)
+        self._set_robot(start[:ARM], float(start[ARM]))
+        states: list[np.ndarray] = []
+        for first in range(0, len(commands), GUARD_BLOCK):
+            states.append(self._run(np.ascontiguousarray(commands[first : first + GUARD_BLOCK])))
+            rows = slice(first, first + len(states[-1]))
+            error = np.abs(states[-1][:, 1 : 1 + ARM] - np.asarray(reference.q[rows], float)).max()
+            if error > arm_stop:
+                out = rows.stop >= int(reference.opens)
+                # On its way back the hand would close again on what it has put down.
+                rest = commands[rows.stop :] if out else way_back(reference, rows.stop)
+                if len(rest):
+                    self._run(np.ascontiguousarray(rest))
+                return np.concatenate(states), True
+        return np.concatenate(states), False
 
     def _tracking_error(self, states: np.ndarray, reference: Reference) -> float:
         """How far a joint was at most from its reference [rad]."""

@@ -196,6 +196,14 @@ def controls(reference: Reference) -> Float[np.ndarray, "steps 9"]:
     return np.concatenate([arm, fingers, fingers], axis=1)
 
 
+def way_back(reference: Reference, steps: int) -> Float[np.ndarray, "steps 9"]:
+    """Commands with which the arm goes back over the first steps of a reference, as `controls`; the fingers, too."""
+    q, velocity, fingers = (
+        np.asarray(a, float)[:steps][::-1] for a in (reference.q, reference.velocity, reference.fingers)
+    )
+    return np.concatenate([q - LAG * velocity, fingers[:, None], fingers[:, None]], axis=1)
+
+
 def resampled(reference: Reference, timestep: float, other: float) -> Reference:
     """A reference for steps of another length, linear between the rows of the given one; the same for the same length.
 

@@ -103,6 +103,38 @@ class TrialScene(NativeWorld):
         scene._record()
         return scene._attempted(kind, reference, index, needed)
 
+    def ends(self, kind: Kind, reference: Reference, arm_stop: float) -> Float[np.ndarray, "2 9 3"]:
+        """Where the bodies come to rest after a motion, in two ways [m]. Uses no JAX.
+
+        Bodies off the board are infinitely far; all is NaN if the simulation diverges.
+        The first is of an arm that goes on where it is held up, the second of one that stops there and goes back.
+
+        Args:
+          kind: of the action.
+          reference: of the arm, as NumPy arrays.
+          arm_stop: error of a joint at which the arm may stop [rad].
+        """
+        on, farthest = self._end(kind, reference, None)
+        return np.stack([on, self._end(kind, reference, arm_stop)[0] if farthest > arm_stop else on])
+
+    def _end(self, kind: Kind, reference: Reference, arm_stop: float | None) -> tuple[Float[np.ndarray, "9 3"], float]:
+        """Where the bodies come to rest [m], and the tracking error [rad]; an arm without a stop goes on."""
+        scene = copy.copy(self)
+        scene._data = copy.copy(self._data)
+        scene._record()
+        if arm_stop is None:
+            states, stopped = scene._follow(reference), False
+        else:
+            states, stopped = scene._guarded(reference, arm_stop)
+        if kind.returns_home or stopped:
+            scene._go_home()
+        scene._rest_again(np.empty((0, 0)))
+        places = scene._data.qpos[ROBOT:].reshape(BODIES, 7)[:, :3].copy()
+        places[scene._fallen()] = np.inf
+        if self.diverged or scene._recorder.diverged:
+            places[:] = np.nan
+        return places, self._tracking_error(states, reference)
+
     def _attempted(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
     ) -> TrialResult | None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -99,10 +100,7 @@ class NativeTrials:
         actions, scenes = jax.device_get((actions, scenes))
 
         def make(row: int) -> tuple[World, TrialScene | None]:
-            objects = jax.tree.map(lambda a: a[row], scenes.objects)
-            world = jax.device_get(_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
-            friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
-            return world, _at_rest(cell.shelf, simulation, world, friction, mass)
+            return self._scene(cell, simulation, scenes, row)
 
         def attempt(
             made: tuple[World, TrialScene | None], row: int, i: int, needed: Callable[[], bool]
@@ -121,6 +119,57 @@ class NativeTrials:
                 return TrialResult.UNKNOWN
 
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
+
+    def ends(
+        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
+        """Where the objects' centres come to rest after an action in each scene [m].
+
+        Objects off the board are infinitely far; all is NaN where the action cannot be simulated.
+        Twice: if an arm that is held up goes on, and if it stops and goes back the way it came.
+
+        Args:
+          problem: constants of the search.
+          scenes: R scenes.
+          actions: one for each, of a kind that moves the arm.
+          arm_stop: error of a joint at which the arm may stop [rad].
+        """
+        return self.ends_in_cell(Cell(problem.target, problem.shelf, problem.gripper), scenes, actions, arm_stop)
+
+    def ends_in_cell(
+        self, cell: Cell, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
+        """`ends` without a problem."""
+        simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
+        actions, scenes = jax.device_get((actions, scenes))
+        count = scenes.objects.valid.shape[-1]
+
+        def end(row: int) -> Float[np.ndarray, "2 n 3"]:
+            nowhere = np.full((2, count, 3), np.nan, np.float32)
+            action: Action = jax.tree.map(lambda a: np.asarray(a[row]), actions)
+            kind = kind_of(int(action.kind))
+            motion = jax.device_get(reference_motion(kind, action, simulation.motion))
+            world, scene = self._scene(cell, simulation, scenes, row)
+            if motion is None or not motion[1] or scene is None:
+                return nowhere
+            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
+                return nowhere
+            try:
+                return scene.ends(kind, motion[0], arm_stop)[:, :count].astype(np.float32)
+            except mujoco.FatalError:
+                return nowhere
+
+        with ThreadPoolExecutor(self.threads or cores()) as pool:
+            return np.stack(list(pool.map(end, range(len(scenes.found)))))
+
+    def _scene(
+        self, cell: Cell, simulation: SimulatorConfig, scenes: TrialScenes, row: int
+    ) -> tuple[World, TrialScene | None]:
+        """The world of a row, and the scene in which it is at rest; None if it cannot be built."""
+        objects = jax.tree.map(lambda a: a[row], scenes.objects)
+        world = jax.device_get(_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
+        friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
+        return world, _at_rest(cell.shelf, simulation, world, friction, mass)
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""

@@ -6,9 +6,8 @@ Threads would not use sixteen cores: the Python part of a trial holds the interp
 from __future__ import annotations
 
 import dataclasses
-import functools
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import jax
 import loky
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.trials.native import Cell, NativeTrials
@@ -28,8 +27,6 @@ from mechsearch_jax.session.preparing import Program
 
 # JAX's settings of its cache on disk.
 CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-# The future results of a scene's actions.
-Pending = Future[Int[np.ndarray, " k"]]
 
 
 class ProcessTrials:
@@ -61,20 +58,29 @@ class ProcessTrials:
         scenes, actions, wanted = jax.device_get((scenes, actions, wanted))
         results = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
 
-        def begin(row: int) -> Pending:
+        def begin(row: int) -> Future[Int[np.ndarray, " k"]]:
             single = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions, wanted))
             return self._workers().submit(_row, self.trials, cell, *single)
 
         rows = np.flatnonzero(wanted.any(axis=1)).tolist()
-        try:
-            pending = {row: begin(row) for row in rows}
-            for row, future in pending.items():
-                results[row] = future.result()
-        except BrokenExecutor:
-            self.close()
-            for row in rows:
-                results[row] = self._alone(functools.partial(begin, row), wanted.shape[1])
+        unknown = np.full(wanted.shape[1], TrialResult.UNKNOWN, np.int32)
+        for row, result in zip(rows, self._each(begin, rows, f"tried {wanted.shape[1]} actions", unknown), strict=True):
+            results[row] = result
         return results
+
+    def ends(
+        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
+    ) -> Float[np.ndarray, "r 2 n 3"]:
+        """See `NativeTrials.ends`; NaN, with a warning, where the simulation ends its process."""
+        cell = _cell(problem)
+        scenes, actions = jax.device_get((scenes, actions))
+        nowhere = np.full((1, 2, scenes.objects.valid.shape[-1], 3), np.nan, np.float32)
+
+        def begin(row: int) -> Future[Float[np.ndarray, "1 2 n 3"]]:
+            single = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions))
+            return self._workers().submit(_ends, self.trials, cell, *single, arm_stop)
+
+        return np.concatenate(self._each(begin, range(len(scenes.found)), "simulated an action", nowhere))
 
     def programs(self, problem: Problem) -> list[Program]:
         """A program that starts the processes and prepares each; see `many_slots.PreparesTrials`."""
@@ -111,17 +117,36 @@ class ProcessTrials:
             )
         return self._pool
 
-    def _alone(self, begin: Callable[[], Pending], count: int) -> Int[np.ndarray, " k"]:
-        """The results of a scene's actions while no other scene is tried."""
+    def _each(
+        self, begin: Callable[[int], Future[np.ndarray]], rows: Sequence[int], what: str, unknown: np.ndarray
+    ) -> list[np.ndarray]:
+        """The results of all rows, each alone if a process dies, and `unknown`, with a warning, if it dies again.
+
+        Args:
+          begin: submits the work of a row.
+          rows: to begin.
+          what: a process did, for the warning.
+          unknown: the result of a row that ends its process.
+        """
         try:
-            return begin().result()
+            pending = [begin(row) for row in rows]
+            return [future.result() for future in pending]
+        except BrokenExecutor:
+            self.close()
+        return [self._alone(begin, row, what, unknown) for row in rows]
+
+    def _alone(
+        self, begin: Callable[[int], Future[np.ndarray]], row: int, what: str, unknown: np.ndarray
+    ) -> np.ndarray:
+        """The result of a row while no other is worked on."""
+        try:
+            return begin(row).result()
         except BrokenExecutor as error:
             self.close()
             warnings.warn(
-                f"a process died as it tried {count} actions ({type(error).__name__}); their results are not known",
-                stacklevel=4,
+                f"a process died as it {what} ({type(error).__name__}); what comes of that is not known", stacklevel=4
             )
-            return np.full(count, TrialResult.UNKNOWN, np.int32)
+            return unknown
 
 
 def _cell(problem: Problem) -> Cell:
@@ -149,3 +174,10 @@ def _row(
 ) -> Int[np.ndarray, " k"]:
     """The results of the actions of a single scene."""
     return trials.in_cell(cell, scenes, actions, wanted)[0]
+
+
+def _ends(
+    trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action, arm_stop: float
+) -> Float[np.ndarray, "1 2 n 3"]:
+    """Where the objects of a single scene come to rest."""
+    return trials.ends_in_cell(cell, scenes, actions, arm_stop)

@@ -26,6 +26,8 @@ PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "sof
 
 # Largest shift of camera and shelf [m], and largest turn [degrees].
 FARTHEST, STEEPEST = 0.2, 20.0
+# Largest error at which an arm stops [rad].
+LARGEST_STOP = 1.0
 # Standard deviation of the usual depth noise [m].
 USUAL_NOISE = 0.001
 # Standard deviation of the usual noise in each channel of colour, 4 of 255.
@@ -44,6 +46,8 @@ class Mismatch:
       friction: factor on all sliding frictions.
       mass: factor on the masses and inertias of all bodies on the shelf.
       physics: contacts and time step of the simulation, one of `simulators.physics.PHYSICS`.
+      arm_stop: an arm with a joint farther than this from its reference stops and goes back the way it came [rad]; 0:
+        it goes on, as trials take it to. Ordinary actions reach 0.027.
       camera_shift, camera_turn: how far the camera stands [m], and how far it is turned about itself [degrees], from
         where the planner takes it to be.
       shelf_shift, shelf_turn: the same of robot base and camera together against the shelf and all that is on it: a
@@ -59,6 +63,9 @@ class Mismatch:
     friction: float = option(1.0, "factor on the simulated world's sliding frictions")
     mass: float = option(1.0, "factor on the masses of the simulated bodies")
     physics: PhysicsName = option("usual", "contacts and time step of the simulated world", get_args(PhysicsName))
+    arm_stop: float = option(
+        0.0, "joint error at which the simulated arm stops and goes back [rad]; 0.03 or more; 0: never"
+    )
     camera_shift: float = option(0.0, "how far the camera stands from where it is taken to be [m]")
     camera_turn: float = option(0.0, "by how much the camera is turned about itself [degrees]")
     shelf_shift: float = option(0.0, "how far the shelf stands from where it is taken to be [m]")
@@ -74,6 +81,7 @@ class Mismatch:
         for name, low, high, unit in (
             ("friction", 0.01, 100.0, ""),
             ("mass", 0.01, 100.0, ""),
+            ("arm_stop", 0.0, LARGEST_STOP, "rad"),
             ("camera_shift", 0.0, FARTHEST, "m"),
             ("camera_turn", 0.0, STEEPEST, "degrees"),
             ("shelf_shift", 0.0, FARTHEST, "m"),
@@ -115,7 +123,7 @@ class Mismatch:
     @property
     def simulates_otherwise(self) -> bool:
         """Whether the simulator has to differ from the usual."""
-        return self.moves_robot or (self.friction, self.mass, self.physics) != (1.0, 1.0, "usual")
+        return self.moves_robot or (self.friction, self.mass, self.physics, self.arm_stop) != (1.0, 1.0, "usual", 0.0)
 
     def mould(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
@@ -135,6 +143,8 @@ class Mismatch:
             )
         if engine != "NativeSimulator" and self.physics != "usual":
             raise InputError("--world-physics: the batch simulator has the usual physics; add --simulator native")
+        if engine != "NativeSimulator" and self.arm_stop:
+            raise InputError("--arm-stop: the batch simulator's arm never stops; add --simulator native")
 
     def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> ActualCell:
         """The cell of an episode, constant until its end.
@@ -155,7 +165,7 @@ class Mismatch:
         T_base_moved = _motion(
             self.camera_shift * camera_way, self.camera_turn * camera_axis, np.array(camera.position)
         )
-        return ActualCell(self.friction, self.mass, self.physics, T_world_base, T_base_moved)
+        return ActualCell(self.friction, self.mass, self.physics, T_world_base, T_base_moved, self.arm_stop)
 
 
 class ActualCell(NamedTuple):
@@ -165,6 +175,7 @@ class ActualCell(NamedTuple):
       friction, mass, physics: as of `Mismatch`.
       T_world_base: where the robot's base stands; the identity where the planner takes it to.
       T_base_moved: what moves the camera, in the base's frame, from where the planner takes it to be to where it is.
+      arm_stop: as of `Mismatch`.
     """
 
     friction: float = 1.0
@@ -172,6 +183,7 @@ class ActualCell(NamedTuple):
     physics: PhysicsName = "usual"
     T_world_base: Float[np.ndarray, "4 4"] = np.eye(4)
     T_base_moved: Float[np.ndarray, "4 4"] = np.eye(4)
+    arm_stop: float = 0.0
 
 
 # As the planner assumes.

@@ -14,8 +14,9 @@ class Failure(enum.IntEnum):
 
     `UNKNOWN`: there is no such kind of action; nothing moved. `UNREACHABLE`: the arm cannot follow the motion; nothing
     moved. `UNSTABLE`: the simulation diverged; the world is as before. `HELD_UP`: something was in the arm's way, so
-    that a joint was farther from its reference than `SimulatorConfig.tracking_bound`. `DROPPED`: the object slipped out
-    of the hand on its way. After the last two the world is as the action left it.
+    that a joint was farther from its reference than `SimulatorConfig.tracking_bound`, or an arm with an `arm_stop`
+    stopped. `DROPPED`: the object slipped out of the hand on its way. After the last two the world is as the action
+    left it.
 
     Retrievals only: `MISSED`: the target is not between the closed fingers. `INSIDE`: it is, but not outside the shelf.
     `FALLEN`: a body fell off the board meanwhile.

@@ -23,7 +23,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 
 Imitated = Literal["nothing", "published-code"]
-RehearsalName = Literal["none", "physics"]
+RehearsalName = Literal["none", "physics", "learning"]
 
 
 class Weights(NamedTuple):
@@ -171,7 +171,7 @@ class Config:
     )
     rehearsal: RehearsalName = option(
         "physics",
-        "what tries the best few actions out before one is made: nothing, or a simulation",
+        "what tries the best few actions out before one is made: nothing, a simulation, one that learns the friction",
         get_args(RehearsalName),
     )
     max_steps: int = option(10, "actions in an episode")

@@ -12,6 +12,7 @@ from mechsearch_jax.config.config import OPTIONS, Config, Option
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
@@ -124,6 +125,8 @@ def load_settings(path: PathLike) -> Settings:
     objects = parts.pop("objects")
     in_base_frame = lambda _: {name: parts[name].moved((-x, -y, -z)) for name in ("camera", "shelf")}  # noqa: E731
     parts |= apply(document, "base", {}, in_base_frame)
+    places = {"outside": parts["gripper"].outside}
+    apply(document, "gripper", places, lambda _: check_outside(parts["gripper"], parts["shelf"]))
     target = _target(document)
     workcell = apply(
         document,

@@ -11,6 +11,7 @@ from mechsearch_jax.images.colour import HUE, RED, TargetColour
 from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
+from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.runtime.errors import InputError
@@ -47,6 +48,7 @@ class Workcell:
 
     def __post_init__(self):
         TargetColour.lit(self.colour, self.hue_tolerance)
+        check_outside(self.gripper, self.shelf)
         room = min(self.shelf.back - self.shelf.front, self.shelf.left - self.shelf.right)
         if not 2 * self.target.inset < room:
             raise InputError(

@@ -45,6 +45,7 @@ from mechsearch_jax.perception.plausibility import (
     sight_faults,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, check_images
+from mechsearch_jax.planner.learning import LearnedFriction, restored
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
@@ -289,15 +290,13 @@ class Searcher:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
         width = None if width is None else checked_width(width, problem.gripper.max_opening)
-        misplaced = self._placement_faults(depth)
-        observation = self.recogniser(recognition_key, depth, colour, mask, target_id).judged()
-        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
-        unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
-        warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
+        observation, warnings, shelf_is_empty = self._seen(recognition_key, depth, colour, mask, target_id)
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        warnings += belief_faults(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
-        decision, motion = self._decide(decision_key, belief, observation, depth, Present(joints, width))
+        warnings += belief_faults(now.belief, belief, shelf_is_empty=shelf_is_empty)
+        learned = self._learned(observation)
+        trials = self._trials if learned is None else learned.trials([0])
+        decision, motion = self._decide(decision_key, trials, belief, observation, depth, Present(joints, width))
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -315,11 +314,51 @@ class Searcher:
         handed = motion.trajectory is not None
         refusals = now.refusals + (not handed)
         latest = now.index, belief, observation, decision.action
-        self._state = State(*latest, handed=handed, acted=False, finished=False, refusals=refusals)
+        self._state = State(
+            *latest,
+            handed=handed,
+            acted=False,
+            finished=False,
+            refusals=refusals,
+            hypothesis_probabilities={} if learned is None else learned.first,
+        )
         return step
 
+    def _seen(
+        self, key: Array, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None
+    ) -> tuple[Observation, list[str], bool]:
+        """What is recognised in images, warnings about them, and whether they show an empty shelf.
+
+        Raises:
+          InputError: as `next`.
+        """
+        problem = self.problem
+        misplaced = self._placement_faults(depth)
+        observation = self.recogniser(key, depth, colour, mask, target_id).judged()
+        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
+        unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
+        warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
+        return observation, warnings, EMPTY_SHELF in unseen
+
+    def _learned(self, observation: Observation) -> LearnedFriction | None:
+        """What trials have learned from all executed actions, with the last images; None if they do not learn.
+
+        An action that was broken off is not what is simulated, and teaches nothing.
+        """
+        now = self._now
+        learned = restored(self._trials, now.hypothesis_probabilities)
+        if learned is not None and now.acted and now.executed:
+            learned.learn_first(self.problem, now.belief, now.observation, now.action, observation)
+        return learned
+
     def _decide(
-        self, key: Array, belief: Belief, observation: Observation, depth: np.ndarray, present: Present
+        self,
+        key: Array,
+        trials: Trials | None,
+        belief: Belief,
+        observation: Observation,
+        depth: np.ndarray,
+        present: Present,
     ) -> tuple[Decision, Motion]:
         """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it.
 
@@ -328,7 +367,7 @@ class Searcher:
         problem, arm = self.problem, self.workcell.arm
         for draw in range(DRAWS):
             draw_key = jax.random.fold_in(key, draw) if draw else key
-            decision = decide(self._policy, self._trials, draw_key, problem, belief, observation)
+            decision = decide(self._policy, trials, draw_key, problem, belief, observation)
             motion = motion_of(problem, belief, observation, decision, depth, present, arm, self._motions)
             if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
@@ -360,7 +399,8 @@ class Searcher:
         """Report that the last step's motion is over, after a failure, too: the hand may have moved something unseen.
 
         Args:
-          ok: whether it was executed to its end. A retrieval that was finishes the search.
+          ok: whether it was executed to its end. A retrieval that was finishes the search; trials that learn do so from
+            other actions that were.
 
         Raises:
           InputError: no motion was returned since the last call.
@@ -369,7 +409,8 @@ class Searcher:
         if not now.handed:
             raise InputError("acted: no motion was handed out since the last one; call next first")
         took = ok and kind_of(int(now.action.kind)).takes_target
-        self._state = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, finished=took, refusals=0)
+        over = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, executed=ok)
+        self._state = dataclasses.replace(over, finished=took, refusals=0)
 
     def save(self, path: PathLike) -> None:
         """Save the search's state as an archive of arrays, .npz, so that `load` can continue it after a crash.
@@ -385,9 +426,15 @@ class Searcher:
         The hand and the target's place may have changed.
 
         Raises:
-          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher.
+          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher, or to trials that
+            learn of other hypotheses.
         """
-        self._state = load_state(self.problem, self._digest, path)
+        state = load_state(self.problem, self._digest, path)
+        try:
+            restored(self._trials, state.hypothesis_probabilities)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        self._state = state
 
     @functools.cached_property
     def _camera_faults(self) -> tuple[str, ...]:

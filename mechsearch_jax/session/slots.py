@@ -6,6 +6,7 @@ from typing import Any
 
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.planner.learning import LearnsFriction
 from mechsearch_jax.planner.policies import PlanningPolicy, Policy, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
@@ -27,9 +28,15 @@ def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: 
 
     Raises:
       InputError: a push model is given together with a policy, a rehearsal is given with a policy that proposes no
-        trials, or the configuration names a model that is not given.
+        trials, the configuration names a model or rehearsal that is not given, or one that learns is named and another
+        given.
     """
     given = [name for name, value in slots.items() if value is not None]
+    if config.rehearsal == "learning" and trials is not None and not isinstance(trials, LearnsFriction):
+        raise InputError(
+            'Searcher: config names the rehearsal "learning", and one that learns nothing is given; give '
+            'rehearsal=LearningTrials() (envs.trials.learning), or a config with rehearsal="physics"'
+        )
     if policy is not None:
         if given:
             raise InputError(
@@ -43,9 +50,10 @@ def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: 
             )
         return policy
     if config.rehearsal != "none" and trials is None:
+        kind, module = ("LearningTrials", "learning") if config.rehearsal == "learning" else ("NativeTrials", "native")
         raise InputError(
             f'Searcher: config names the rehearsal "{config.rehearsal}", and none is given; use '
-            "mechsearch_jax.envs.cell.loading.load_searcher, give rehearsal=NativeTrials() (envs.trials.native), or a "
+            f"mechsearch_jax.envs.cell.loading.load_searcher, give rehearsal={kind}() (envs.trials.{module}), or a "
             'config with rehearsal="none"'
         )
     if slots["push_model"] is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -39,6 +39,9 @@ class State:
       acted: whether the action was executed or attempted since the last images.
       finished: whether the target was taken out.
       refusals: number of steps without a motion since the last action.
+      executed: whether that action was executed to its end.
+      hypothesis_probabilities: what trials that learn hold of each hypothesis by its name, see
+        `planner.learning.LearnsFriction`; empty if they do not learn, or have not yet.
     """
 
     index: int
@@ -49,6 +52,8 @@ class State:
     acted: bool
     finished: bool
     refusals: int = 0
+    executed: bool = True
+    hypothesis_probabilities: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 _PLAIN: dict[str, Callable[[Any], Any]] = {
@@ -57,7 +62,11 @@ _PLAIN: dict[str, Callable[[Any], Any]] = {
     "acted": bool,
     "finished": bool,
     "refusals": int,
+    "executed": bool,
+    "hypothesis_probabilities": lambda values: {str(name): float(value) for name, value in values.items()},
 }
+# What states hold that were saved before these fields existed.
+_ADDED: dict[str, Any] = {"executed": True, "hypothesis_probabilities": {}}
 _PYTREES = ("belief", "observation", "action")
 
 
@@ -86,8 +95,9 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
         head = json.loads(str(arrays.pop("head")))
         if (head["format"], head["version"]) != (FORMAT, VERSION):
             raise ValueError
+        head = _ADDED | head
         kept, rest = head["digest"], {name: read(head[name]) for name, read in _PLAIN.items()}
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: is no search that was saved; begin a new one") from error
     if kept != digest:
         raise InputError(
