@@ -28,6 +28,7 @@ OTHERS = {"pip", "git", "ray", "source", "pytest", "mkdocs", "wait", "search_nod
 # Words of the shell in front of a command, and what stands for a value in it.
 IN_FRONT = re.compile(r"^(?:(?:for \w+ in [^;]+; *do\b|do\b|[A-Z_]+=(?:\$\(\(.*?\)\)(?= )|\S+)) *)+")
 VARIABLES = {"$table": "table3", "$k": "0"}
+UNREADABLE = "unreadable"
 
 
 def blocks(page):
@@ -36,14 +37,23 @@ def blocks(page):
 
 
 def commands(page):
-    """The commands of a page's shell blocks, each as its words."""
+    """The commands of a page's shell blocks, each as its words.
+
+    What cannot be read becomes a command of its own kind, that no test accepts, so that all others are still tested.
+    """
     for language, text in blocks(page):
         if language in ("sh", "bash"):
             for line in re.split(r"\n| && ", text.replace("\\\n", " ")):
                 line = re.sub(r" *[;&]? *(?:\bdone\b.*)?$", "", IN_FRONT.sub("", line.strip()))
-                words = shlex.split(line, comments=True)
+                try:
+                    words = shlex.split(line, comments=True)
+                    words = [re.sub(r"\$\w+", lambda name: VARIABLES[name[0]], word) for word in words]
+                except ValueError as error:
+                    words = [UNREADABLE, f"{page}: {line!r}: {error}"]
+                except KeyError as error:
+                    words = [UNREADABLE, f"{page}: {line!r}: nothing in VARIABLES stands for {error}"]
                 if words:
-                    yield [re.sub(r"\$\w+", lambda name: VARIABLES[name[0]], word) for word in words]
+                    yield words
 
 
 def named(page):
@@ -59,6 +69,7 @@ def test_every_block_is_of_a_kind_that_is_tested():
 @pytest.mark.parametrize("page", [page for page in PAGES if any(commands(page))], ids=named)
 def test_commands_are_understood(page):
     for program, *arguments in commands(page):
+        assert program != UNREADABLE, arguments[0]
         if program == "mechsearch":
             assert callable(cli.parse(arguments)), arguments
         elif program == "python" and arguments[0] == "-m":
@@ -84,6 +95,17 @@ def test_what_is_no_command_is_noticed(tmp_path):
     loop = "for k in 0 1; do A=$k B=$(($(nproc) / 8)) mechsearch study gamma --out rows/$k & done  # all"
     page.write_text(f"```sh\n{loop}\n```\n")
     assert list(commands(page)) == [["mechsearch", "study", "gamma", "--out", "rows/0"]]
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [("mechsearch search 'first-light", "No closing quotation"), ("mechsearch search $scene", r"\$scene")],
+)
+def test_what_cannot_be_read_is_named_with_its_page(tmp_path, line, why):
+    page = tmp_path / "page.md"
+    page.write_text(f"```sh\nmechsearch doctor\n{line}\n```\n")
+    with pytest.raises(AssertionError, match=rf"page\.md: .*{why}"):
+        test_commands_are_understood(page)
 
 
 def test_settings_in_files_are_read(tmp_path):

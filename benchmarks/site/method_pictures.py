@@ -26,11 +26,13 @@ import mechsearch_jax as ms
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
+from mechsearch_jax.envs.world.world import from_scenario
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import replacing
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.filmstrip import draw_believed
 from mechsearch_jax.viz.maps import Maps, maps_figure
-from mechsearch_jax.workspace.scenario import example_scenarios
+from mechsearch_jax.workspace.scenario import Scenario, example_scenarios, load_scenario
 
 SCENE = "crowded-shelf"
 OUT = Path("docs/pictures")
@@ -38,6 +40,8 @@ OUT = Path("docs/pictures")
 SHOWS = "scene"
 # Steps of the search that are shown, at most, and the width of one [inch].
 STEPS, _WIDTH = 6, 3.6
+# How far a body of a recording may stand from where the scene has it [m].
+_SAME_PLACE = 0.01
 
 
 def search(folder: Path) -> Recording:
@@ -45,6 +49,24 @@ def search(folder: Path) -> Recording:
     program = (sys.executable, "-m", "mechsearch_jax.commands.main")
     subprocess.run([*program, "search", SCENE, "--out", str(folder), "--record"], check=True)
     return load_recording(folder / NAME)
+
+
+def check_scene(recording: Recording, scenario: Scenario, path: Path) -> None:
+    """Check that a recording begins with a scene.
+
+    Raises:
+      InputError: it is of another one.
+    """
+    begins, scene = (jax.device_get(world) for world in (recording.steps[0].world, from_scenario(scenario)))
+    same = np.array_equal(begins.valid, scene.valid) and all(
+        np.allclose(getattr(begins, name)[scene.valid], getattr(scene, name)[scene.valid], rtol=0.0, atol=tolerance)
+        for name, tolerance in (("kind", 0), ("half_size", 1e-4), ("position", _SAME_PLACE))
+    )
+    if not same:
+        raise InputError(
+            f"{path}: is of another scene than {scenario.name}; record it by `mechsearch search {SCENE} --out FOLDER "
+            "--record`, or leave --recording out"
+        )
 
 
 def maps(recording: Recording) -> Figure:
@@ -116,7 +138,7 @@ def _arrow(axes: Axes, path: Float[np.ndarray, "points 3"] | None, colour: list[
 
 
 def steps(recording: Recording) -> Figure:
-    """f and g from step to step, with each action and where objects are expected to go."""
+    """f and g from step to step, with each action and where objects are expected to go; of the first `STEPS` steps."""
     shown = recording.steps[:STEPS]
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
@@ -132,6 +154,9 @@ def steps(recording: Recording) -> Figure:
         drawing.draw_objects(axes, step.scene)
         drawing.draw_target(axes, step.target_pose, recording.target, step.found)
         axes.set_title(f"{step.title}\n{step.caption.split(' · ')[0]}", fontsize=8.5, color=drawing.INK, loc="left")
+    if len(shown) < len(recording.steps):
+        heading = f"The first {len(shown)} of {len(recording.steps)} steps"
+        figure.suptitle(heading, fontsize=10, color=drawing.INK)
     drawing.draw_legend(figure, 0.22 / height)
     return figure
 
@@ -150,9 +175,19 @@ def main() -> None:
     parser.add_argument("--recording", type=Path, help=f"recording.npz of a search of {SCENE}; searched anew without")
     parser.add_argument("--out", default=OUT, type=Path, help="folder of the pictures")
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        recording = load_recording(arguments.recording) if arguments.recording else search(Path(folder))
-    shows = ms.load_scenario(example_scenarios()[SCENE]).content_hash
+    scenario = load_scenario(example_scenarios()[SCENE])
+    try:
+        if arguments.recording:
+            recording = load_recording(arguments.recording)
+            check_scene(recording, scenario, arguments.recording)
+        else:
+            with tempfile.TemporaryDirectory() as folder:
+                recording = search(Path(folder))
+    except InputError as error:
+        raise SystemExit(str(error)) from error
+    if len(recording.steps) > STEPS:
+        print(f"steps.png shows the first {STEPS} of {len(recording.steps)} steps, and says so")
+    shows = scenario.content_hash
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name, draw in PICTURES.items():
         with replacing(arguments.out / f"{name}.png") as file:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ from typing import Any
 import jinja2
 
 from mechsearch_jax.benchmarks.report.results_page import table
-from mechsearch_jax.benchmarks.site.set_texts import ABOUT, About
+from mechsearch_jax.benchmarks.site.set_texts import ABOUT, CLUTTER, About, sets_of
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, SceneSet, digest, is_chosen_on
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
 RESULTS = Path("benchmarks/results")
@@ -25,12 +27,17 @@ OUT = Path("docs/scene-sets")
 MEASURES = ("retrieved", "found", "graspable")
 # What variants on a set's page may differ in; others belong to studies.
 SHOWN = ("policy", "recognition", "protocol", "actions", "rehearsal", "retrieval_contact")
-_PRESETS = ("standard", "published-code", "paper")
+_PRESETS = ("standard", "best", "published-code", "paper")
 _WORDS = {
     "rehearsal=none": "without trials",
+    "rehearsal=learning": "with trials that learn the friction",
     "retrieval_contact=False": "with grasps that touch nothing",
     "retrieval_contact=True": "with grasps that may touch objects",
 }
+
+# What most runs simulated with; a label names another one.
+_USUAL_SIMULATOR = "MjxSimulator"
+_ROOT = Path(__file__).parents[2]
 
 Line = Mapping[str, Any]
 
@@ -48,16 +55,33 @@ def blocks_shown(scene_set: SceneSet, about: About) -> list[tuple[Block, int]]:
 
 
 def label(line: Line) -> str:
-    """A variant in words: its preset and what differs from it."""
+    """A variant in words: its preset, what differs from it, and the simulator where that is not the usual one."""
     settings = dict(line["settings"])
     words = [f"`{line['preset']}`"]
     words += [f"`{settings[name]}`" for name in ("policy", "recognition") if name in settings]
     if "protocol" in settings:
         words.append(f"protocol `{settings['protocol']}`")
     if "actions" in settings:
-        words.append(" and ".join(settings["actions"]) + " alone")
+        *kinds, last = settings["actions"]
+        words.append((", ".join(kinds) + " and " if kinds else "") + f"{last} alone")
     pairs = (f"{name}={settings[name]}" for name in ("rehearsal", "retrieval_contact") if name in settings)
-    return ", ".join([*words, *(_WORDS.get(pair, pair) for pair in pairs)])
+    words += [_WORDS.get(pair, pair) for pair in pairs]
+    if line["simulator"] != _USUAL_SIMULATOR:
+        words.append(f"in `{line['simulator']}`")
+    return ", ".join(words)
+
+
+@functools.cache
+def _own_settings(config: str) -> dict[str, Any]:
+    """What a shelf's configuration file sets, by the names that the lines of stored runs have for it."""
+    tables = tomllib.loads((_ROOT / config).read_text(encoding="utf-8")) if config else {}
+    return {f"workcell.{table}.{key}": value for table, keys in tables.items() for key, value in keys.items()}
+
+
+def is_shown(line: Line, about: About) -> bool:
+    """Whether a line has a row on the page of its set: it differs in `SHOWN` alone, and in what the set's shelf is."""
+    own = _own_settings(about.config)
+    return all(name in SHOWN or (name in own and own[name] == value) for name, value in line["settings"].items())
 
 
 def rates_of(line: Line) -> Mapping[str, Any]:
@@ -72,12 +96,32 @@ def _order(line: Line) -> tuple[Any, ...]:
     return preset, settings.get("protocol", ""), label(line), line["run"]
 
 
-def rate_tables(lines: Sequence[Line]) -> dict[str, str]:
-    """By measure a table of shares, with a row for each variant of each run and a column for each number of objects."""
-    counts = sorted({line["objects"] for line in lines})
+def _by_variant(lines: Iterable[Line]) -> dict[tuple[str, str], dict[int, Line]]:
+    """Lines in the order of rows: by label and run, and then by number of objects.
+
+    Raises:
+      InputError: two lines of a run would share a cell.
+    """
     variants: dict[tuple[str, str], dict[int, Line]] = {}
     for line in sorted(lines, key=_order):
-        variants.setdefault((label(line), line["run"]), {})[line["objects"]] = line
+        by_count = variants.setdefault((label(line), line["run"]), {})
+        if line["objects"] in by_count:
+            raise InputError(
+                f"{RESULTS}/runs/{line['run']}.jsonl: two lines with {line['objects']} objects read {label(line)!r}; "
+                "let `label` in benchmarks/site/set_pages.py say what tells them apart"
+            )
+        by_count[line["objects"]] = line
+    return variants
+
+
+def rate_tables(lines: Sequence[Line]) -> dict[str, str]:
+    """By measure a table of shares, with a row for each variant of each run and a column for each number of objects.
+
+    Raises:
+      InputError: two lines of a run would share a cell.
+    """
+    counts = sorted({line["objects"] for line in lines})
+    variants = _by_variant(lines)
     tables = {}
     for measure in MEASURES:
         rows = [
@@ -100,14 +144,20 @@ def _cell(line: Line | None, measure: str) -> str:
     return f"{rate['rate']:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _parts(scene_set: SceneSet) -> str:
+def _parts(scene_sets: Sequence[SceneSet]) -> str:
     rows = []
-    for block in scene_set.blocks:
+    for block in (block for scene_set in scene_sets for block in scene_set.blocks):
         seeds = f"{block.first_seed} to {block.first_seed + block.scenes - 1}"
         chosen = sum(is_chosen_on(block.scene_name(index)) for index in range(block.scenes))
         ends = f"`{block.scene_name(0)}` to `{block.scene_name(block.scenes - 1)}`"
         rows.append([f"`{block.name}`", block.scenes, block.objects, block.target, seeds, ends, chosen])
     return table(["part", "scenes", "objects", "target", "seeds", "names", "settings were chosen on"], rows)
+
+
+def _digests(scene_sets: Sequence[SceneSet]) -> str:
+    if len(scene_sets) == 1:
+        return f"The digest of what they hold is {digest(scene_sets[0])}."
+    return "Digests of what they hold: " + ", ".join(f"`{each.name}` {digest(each)}" for each in scene_sets) + "."
 
 
 def _starts(results: PathLike, name: str) -> str:
@@ -150,33 +200,47 @@ def _template() -> jinja2.Template:
     return environment.from_string(Path(__file__).with_name("set_page.md.jinja").read_text(encoding="utf-8"))
 
 
-def page(name: str, lines: Iterable[Line], results: PathLike) -> str:
-    """The page of a set in Markdown.
+def _rates(name: str, lines: Iterable[Line], about: About) -> dict[str, Any]:
+    """What came of the stored runs on a set, for the template: tables, their scope, and where other variants are."""
+    of_set = [line for line in lines if line["scene_set"] == name]
+    shown = [line for line in of_set if is_shown(line, about)]
+    partly = any(0 < line["scenes_chosen_on"] < line["scenes"] for line in shown)
+    others = sorted({line["run"] for line in of_set if not is_shown(line, about)})
+    links = ", ".join(f"[{run}](../../{RESULTS}/runs/{run}.jsonl)" for run in others)
+    return {
+        "tables": rate_tables(shown),
+        "scope": "Shares are of episodes on scenes that nothing was chosen on." if partly else "",
+        "others": f"Other variants ran on it in {links}: [studies](../studies.md)." if others else "",
+    }
+
+
+def page(name: str, lines: Sequence[Line], results: PathLike) -> str:
+    """The page of a set, or of several, in Markdown.
 
     Args:
-      name: of the set, or "published".
+      name: one of `ABOUT`.
       lines: of `stored_lines`.
       results: folder of stored results.
+
+    Raises:
+      InputError: two lines of a run would share a cell of a table.
     """
-    about, scene_set = ABOUT[name], SETS.get(name)
-    of_set = [line for line in lines if line["scene_set"] == name]
-    shown = [line for line in of_set if set(line["settings"]) <= set(SHOWN)]
-    partly = any(0 < line["scenes_chosen_on"] < line["scenes"] for line in shown)
-    more = sorted({line["run"] for line in of_set} - {line["run"] for line in shown})
-    links = ", ".join(f"[{run}](../../{RESULTS}/runs/{run}.jsonl)" for run in more)
+    about = ABOUT[name]
+    scene_sets = [SETS[each] for each in sets_of(name) if each in SETS]
+    rates = {each: _rates(each, lines, about) for each in sets_of(name)}
+    used = {line["scene_set"] for line in lines}
+    to_run = next((each for each in about.sets if each not in used), sets_of(name)[0])
     text = _template().render(
         name=name,
         about=about,
         picture=f"{name}.png" if about.shown else "",
-        shown=[block.scene_name(index) for block, index in blocks_shown(scene_set, about)] if scene_set else [],
-        parts=_parts(scene_set) if scene_set else "",
-        digest=f"\nThe digest of what they hold is {digest(scene_set)}." if scene_set else "",
+        shown=[block.scene_name(index) for block, index in blocks_shown(scene_sets[0], about)] if scene_sets else [],
+        parts=_parts(scene_sets) if scene_sets else "",
+        digests=_digests(scene_sets) if scene_sets else "",
         starts=_starts(results, name),
-        commands=_commands(name, about, scene_set),
-        rates=rate_tables(shown) if shown else {},
+        commands=_commands(to_run, about, SETS.get(to_run)),
+        rates=rates,
         scope=f"The paper's {about.paper}; [beside its figures](../reproduction.md)." if about.paper else "",
-        scenes_of_rates=" on scenes that nothing was chosen on" if partly else "",
-        others=f"Other variants ran on it in {links}: [studies](../studies.md)." if more else "",
     )
     return _tidy(text)
 
@@ -193,12 +257,13 @@ def _tidy(text: str) -> str:
 def index_page(lines: Sequence[Line]) -> str:
     """The page that lists all sets, in Markdown."""
     rows = []
-    for name, about in ABOUT.items():
-        scene_set = SETS.get(name)
-        counts = ", ".join(str(block.objects) for block in scene_set.blocks) if scene_set else "2, 4, 6, 8"
-        scenes = scene_set.scenes if scene_set else 100
-        runs = len({line["run"] for line in lines if line["scene_set"] == name})
-        rows.append([f"[`{name}`]({name}.md)", about.title, scenes, counts, runs or "–"])
+    for page_name, about in ABOUT.items():
+        for name in sets_of(page_name):
+            scene_set = SETS.get(name)
+            counts = ", ".join(str(block.objects) for block in scene_set.blocks) if scene_set else "2, 4, 6, 8"
+            scenes = scene_set.scenes if scene_set else 100
+            runs = len({line["run"] for line in lines if line["scene_set"] == name})
+            rows.append([f"[`{name}`]({page_name}.md)", about.title, scenes, counts, runs or "–"])
     text = f"""# Scene sets
 
 Scenes have names, and any command takes them: `mechsearch evaluate c2 --out rows` runs all of a set, `c2-4` a part,
@@ -212,9 +277,26 @@ Which one?
 - **To try something**: `development`, as often as you like.
 - **To compare with the paper**: `c2`, `d1`, `d2`, `d3`. Of `c2` report numbers 090 and up: settings were chosen on the
   others.
-- **To report a change**: one of the sets `report-*` on whose page no run stands yet. Decide what you compare before you
-  run it.
+- **To report a change**: one of the sets [`report-*`](report.md) that nothing ran on yet. Decide what you compare
+  before you run it.
 - **To see what another shelf does**: `shelf-*`.
+
+## How they are made
+
+{CLUTTER}
+
+So are all sets but `d1` and `published`, whose pages say how they are. A page lists a set's seeds, and a digest of what
+its scenes hold.
+
+## How to read the rates
+
+Every row on a set's page is a variant of a [stored run](../commands.md#stored-runs): a preset and what differs from it,
+which has search-for-grasp, true shapes, [protocol](../method.md#protocols) `strict` and the simulator
+`{_USUAL_SIMULATOR}` where it does not say otherwise. Columns are numbers of objects. A cell is a share of episodes,
+with a 95% interval that knows that [seeds of a scene are alike](../commands.md#reports). [What the words
+mean](../method.md#verdicts).
+
+## Write these pages anew
 
 `python -m mechsearch_jax.benchmarks.site.set_pages` writes these pages from the declared sets and the stored runs, with
 `--pictures` the pictures too.
@@ -237,8 +319,12 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.results / "runs").is_dir():
         parser.error(f"{arguments.results}: holds no runs; start it at the root of a checkout, or give --results")
+    try:
+        texts = pages(arguments.results)
+    except InputError as error:
+        raise SystemExit(str(error)) from error
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, text in pages(arguments.results).items():
+    for name, text in texts.items():
         with replacing(arguments.out / name) as file:
             file.write(text.encode())
     if arguments.pictures:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-from mechsearch_jax.envs.scenes.scene_sets import SETS
-
-_CLUTTER = (
+# Said once, on the page that lists all sets.
+CLUTTER = (
     "Objects are drawn evenly among eleven boxes and cylinders and dropped onto the board, where they come to rest. "
-    "The target stands anywhere on the board, at a place where it shows at most 100 pixels and could be grasped if "
-    "nothing stood around it. A scene follows from its seed and its number of objects alone."
+    "The target stands anywhere in the rectangle that the candidate positions span, the board less 50 mm on each side, "
+    "at a place where it shows at most 100 pixels and could be grasped if nothing stood around it. A scene follows "
+    "from its seed and its number of objects alone."
 )
-_REPORTING = (
-    "A set to report one larger change with: made as [`c2`](c2.md) is, from seeds that no other set has. It is used "
-    "once, because scenes that were looked at are no longer unseen. So nothing of it is shown here beforehand."
-)
-_USED = "The baselines and the robustness [studies](../studies.md) ran on it, so that it is no longer unseen."
+_AS_MOST = "[As most sets are](index.md#how-they-are-made), from the seeds below."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,20 +19,22 @@ class About:
     """The words of a page.
 
     Attributes:
-      title: of the page, after the set's name.
+      title: of the page, after its name.
       what: a paragraph on what the set is and what it is for.
       made: a paragraph on how it is made.
       shown: numbers of objects and numbers of the scenes in the picture, in order; none where there is no picture.
       config: file that gives the shelf, from the root of the repository; empty for the usual one.
       paper: what of the paper it corresponds to; empty for nothing.
+      sets: names of the sets that the page is about, where it is not named after its only one.
     """
 
     title: str
     what: str
-    made: str = _CLUTTER
+    made: str = _AS_MOST
     shown: tuple[tuple[int, int], ...] = ()
     config: str = ""
     paper: str = ""
+    sets: tuple[str, ...] = ()
 
 
 _EACH = tuple((objects, 0) for objects in (2, 4, 6, 8))
@@ -56,7 +54,7 @@ ABOUT: dict[str, About] = {
     ),
     "d1": About(
         "one behind the other",
-        "A toy problem with a known answer. Two large cylinders stand in line between the camera and the target, and "
+        "A problem with a known answer. Two large cylinders stand in line between the camera and the target, and "
         "each hides it by itself: both have to be moved, so that no search takes fewer than two actions before the "
         "target is in sight.",
         "The target stands at x 0.70 m, y 0.05 m. The cylinders have radii of 26 to 36 mm and heights of 0.12 to "
@@ -89,10 +87,13 @@ ABOUT: dict[str, About] = {
         "Made as [`d3`](d3.md) is, for trying things and choosing settings where the target is a box.",
         shown=((4, 0), (4, 1), (8, 0), (8, 1)),
     ),
-    "report-a": About("to report with", f"{_REPORTING} {_USED}"),
-    "report-b": About("to report with", _REPORTING),
-    "report-c": About("to report with", _REPORTING),
-    "report-d": About("to report with", _REPORTING),
+    "report": About(
+        "to report with",
+        "Four sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
+        "Each is used once, because scenes that were looked at are no longer unseen; so no picture of them is shown. "
+        "Those with rates below are used: `report-a` by the baselines and the robustness [studies](../studies.md).",
+        sets=("report-a", "report-b", "report-c", "report-d"),
+    ),
     **{
         f"shelf-{name}": About(
             f"{words}",
@@ -109,11 +110,14 @@ ABOUT: dict[str, About] = {
     "published": About(
         "of the method's authors",
         "The scenes that the method's authors published with their code: 200, of which 100 were used here, 25 each "
-        "with 2, 4, 6 and 8 objects. They are no named set, since their repository names no licence: who has a copy "
-        "[imports it](../method.md#the-published-scenes). Settings were chosen on them. No picture is shown for the "
-        "same reason.",
-        "By the authors, in PyBullet. In three of them [the target shows more than 100 "
+        "with 2, 4, 6 and 8 objects. Settings were chosen on them. Their repository names no licence: so they are no "
+        "named set, no picture of them is shown, and who has a copy [imports it](../method.md#the-published-scenes).",
+        "By the authors, in PyBullet. In three of the 100 used [the target shows more than 100 "
         "pixels](../experiments.md#what-scenes-are-like) at the start.",
     ),
 }
-assert {name for name, each in SETS.items() if each.about} | {"published"} == set(ABOUT)
+
+
+def sets_of(name: str) -> tuple[str, ...]:
+    """The names of the sets that a page is about."""
+    return ABOUT[name].sets or (name,)
