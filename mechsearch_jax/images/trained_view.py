@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -127,7 +127,7 @@ def read_view(card: Mapping[str, Any], where: str) -> TrainedView | None:
     )
 
 
-def _table(value: Any, names: typing.Iterable[str], where: str) -> dict[str, Any]:
+def _table(value: Any, names: Iterable[str], where: str) -> dict[str, Any]:
     if not isinstance(value, dict) or value.keys() != set(names):
         raise InputError(f"{where}: {shown(value)} must hold {', '.join(names)}; train or install anew")
     return value
