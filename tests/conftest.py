@@ -60,6 +60,7 @@ GROUPS = {
         "test_preparing",
         "test_readme",
         "test_docs",
+        "test_doc_blocks",
     ),
     "pushing": ("test_benchmarks_push", "test_envs_pushes"),
     "recognising": (

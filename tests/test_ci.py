@@ -34,6 +34,13 @@ def test_the_gate_has_a_reference_for_each_of_its_episodes():
     assert [comparison.measure for comparison in guard.compare(outcomes, outcomes)] == list(guard.MEASURES)
 
 
+def test_the_site_is_built_so_that_a_broken_link_fails():
+    (line,) = re.findall(r"mkdocs' (build .*?)\"$", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    assert "--strict" in line
+    # It hides warnings, and strict counts none then.
+    assert "--quiet" not in line
+
+
 @pytest.fixture
 def release(tmp_path):
     """Runs the command on a checkout of its own, with the Pythons of these versions."""

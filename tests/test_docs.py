@@ -28,7 +28,7 @@ from mechsearch_jax.workspace.detector import FOUND_PIXELS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks/results"
-PAGES = ["README.md", "CHANGELOG.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
+PAGES = ["README.md", "CHANGELOG.md", *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))]
 # Links and code may stand between backticks or in a block without meaning what they say.
 BLOCK = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
@@ -107,10 +107,11 @@ def test_files_that_a_page_names_are_there(page):
         assert any((ROOT / folder / path).is_file() for folder in ("", *SOURCE)), f"{page}: {path}"
 
 
-def test_what_the_python_guide_names_of_modules_is_there():
+def test_what_the_python_guides_name_of_modules_is_there():
     package, count = ROOT / "mechsearch_jax", 0
     rooms = {path.stem for path in package.iterdir()} | set(SOURCE)
-    for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", read("docs/python.md")):
+    guides = "\n".join(read(f"docs/{name}.md") for name in ("python", "extend", "camera"))
+    for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", guides):
         folders = [folder for folder in path.strip(".").split(".") if folder != "mechsearch_jax"]
         if folders and folders[0] in rooms:
             places = [root.joinpath(*folders) for root in (package, ROOT)]
@@ -127,6 +128,13 @@ def test_the_python_guide_names_all_of_the_front_door():
     assert f"gives the {len(mechsearch_jax.__all__)} names" in guide
     for name in mechsearch_jax.__all__:
         assert re.search(rf"`(?:[^`]*\W)?{name}\b", guide), name
+
+
+def test_the_api_pages_hold_all_of_the_front_door():
+    pages = "\n".join(read(page) for page in PAGES if page.startswith("docs/api/"))
+    shown = re.findall(r"^::: mechsearch_jax\.([\w.]+)\.(\w+)$", pages, re.MULTILINE)
+    assert len(shown) == len(set(shown))
+    assert set(mechsearch_jax._ROOMS.items()) <= {(name, room) for room, name in shown}
 
 
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
@@ -539,13 +547,6 @@ def test_what_calibration_finds_is_what_is_stored():
     usual = stored["summary"][1]
     statement = f"of {usual['without an offset']} looks without an offset {usual['false warnings']} are warned of"
     assert statement in page
-
-
-@pytest.mark.slow
-def test_the_code_of_the_python_guide_runs():
-    code = re.findall(r"^```python\n(.*?)^```$", read("docs/python.md"), re.MULTILINE | re.DOTALL)
-    # Classes in it are pytrees, and look for the module that they are defined in.
-    exec(compile("\n".join(code), "docs/python.md", "exec"), {"__name__": "guide"})
 
 
 def glossary():

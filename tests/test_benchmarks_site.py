@@ -1,0 +1,202 @@
+"""The pages of scene sets are what declared sets and stored runs say, and pictures show today's scenes."""
+
+import dataclasses
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from recordings import RECORDING
+from stored_rows import USUAL, row_of
+
+from mechsearch_jax.benchmarks.site import method_pictures, set_pages
+from mechsearch_jax.benchmarks.site.set_texts import ABOUT, sets_of
+from mechsearch_jax.benchmarks.statistics.variants import Key
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.recording.recording import save_recording
+from mechsearch_jax.envs.scenes.scene_sets import SETS, recorded
+from mechsearch_jax.envs.world.world import from_scenario
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs/scene-sets"
+SHOWN = [name for name, about in ABOUT.items() if about.shown]
+
+
+def line(objects, rate, **settings):
+    """A line of a stored run: `rate` on all scenes, and 0.5 on those that nothing was chosen on."""
+    rates = {key: {"rate": rate, "interval": [rate - 0.1, rate + 0.1]} for key in set_pages.MEASURES}
+    unseen = {key: {"rate": 0.5, "interval": [0.4, 0.6]} for key in set_pages.MEASURES}
+    return {
+        "run": "some-run",
+        "preset": "standard",
+        "settings": settings,
+        "simulator": "MjxSimulator",
+        "scene_set": "c2",
+        "objects": objects,
+        "episodes": 20,
+        "scenes": 20,
+        "scenes_chosen_on": 10,
+        **rates,
+        "on_scenes_not_chosen_on": {"episodes": 10, **unseen},
+    }
+
+
+SHELF = {"workcell.shelf.back": 0.864, "workcell.shelf.left": 0.55, "workcell.shelf.right": -0.35} | {
+    "workcell.shelf.spawn_x": [0.45, 0.8],
+    "workcell.shelf.spawn_y": [-0.25, 0.45],
+}
+PAGES_OF_SETS = f"run `python -m {set_pages.__name__}`"
+NAMES = "benchmarks/site/set_texts.py"
+
+
+def rates_on(name, *lines):
+    """The end of a page where lines of a set's runs are shown."""
+    of_set = [{**each, "scene_set": name} for each in lines]
+    return set_pages.page(name, of_set, ROOT / "benchmarks/results").split("## Rates", 1)[1]
+
+
+def test_every_set_is_on_a_page():
+    on_pages = [each for name in ABOUT for each in sets_of(name) if each != "published"]
+    declared = [name for name, each in SETS.items() if each.about]
+    assert sorted(on_pages) == sorted(declared), f"give each set of scene_sets.SETS an entry of ABOUT in {NAMES}"
+
+
+def test_the_pages_are_what_the_stored_runs_say():
+    pages = set_pages.pages(ROOT / "benchmarks/results")
+    written = {file.name: file.read_text(encoding="utf-8") for file in FOLDER.glob("*.md")}
+    assert set(written) == set(pages), f"{PAGES_OF_SETS}, and remove pages that it does not write"
+    different = [name for name, text in pages.items() if written[name] != text]
+    assert not different, PAGES_OF_SETS
+
+
+def test_every_set_has_a_page_in_the_navigation():
+    navigation = re.findall(r"scene-sets/(.+)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert navigation == ["index", *ABOUT], f"let nav of mkdocs.yml list the entries of ABOUT in {NAMES}, in order"
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_a_picture_shows_the_scenes_on_record(name):
+    with Image.open(FOLDER / f"{name}.png") as picture:
+        hashes = picture.text["scenes"].split()
+    shown = set_pages.blocks_shown(SETS[name], ABOUT[name])
+    assert hashes == [recorded()[block.name][index] for block, index in shown], f"{PAGES_OF_SETS} with --pictures"
+    assert (FOLDER / f"{name}.png").stat().st_size < 400_000
+
+
+def test_pictures_are_of_sets_alone_that_may_be_looked_at():
+    drawn = {file.stem for file in FOLDER.glob("*.png")}
+    assert drawn == set(SHOWN), f"{PAGES_OF_SETS} with --pictures, and remove pictures that it does not draw"
+    assert "report" not in SHOWN
+
+
+def test_rates_are_of_scenes_that_nothing_was_chosen_on():
+    tables = set_pages.rate_tables([line(2, 0.9), line(8, 0.8, policy="random")])
+    rows = [row for row in tables["Retrieved"].splitlines() if row.startswith("| `")]
+    cell = "0.50 (0.40 to 0.60)"
+    assert [row.split(" | ")[:4] for row in rows] == [
+        ["| `standard`", "10", cell, "–"],
+        ["| `standard`, `random`", "10", "–", cell],
+    ]
+
+
+def test_what_a_set_takes_from_its_shelf_is_no_variant():
+    text = rates_on("shelf-wide", line(2, 0.9, **SHELF), line(4, 0.9, **SHELF, recognition="masks"))
+    assert "| `standard` | 10 | 0.50" in text
+    assert "| `standard`, `masks` | 10 | – | 0.50" in text
+    assert "Nothing" not in text
+    assert "Other variants" not in text
+
+
+@pytest.mark.parametrize("changed", [{"workcell.shelf.back": 0.8}, {"mismatch.friction": 0.5}])
+def test_a_variant_without_a_row_is_linked(changed):
+    text = rates_on("shelf-wide", line(2, 0.9, **SHELF | changed))
+    assert "Other variants ran on it in [some-run]" in text
+    assert "Nothing" not in text
+    assert "| `standard` |" not in text
+
+
+def test_a_set_that_nothing_ran_on_says_so():
+    assert "Nothing that is stored ran on it yet." in rates_on("shelf-wide")
+
+
+def test_sets_on_one_page_have_rates_of_their_own():
+    lines = [{**line(2, 0.9), "scene_set": "report-b"}]
+    text = set_pages.page("report", lines, ROOT / "benchmarks/results")
+    first, second, *rest = text.split("## Rates on ")[1:]
+    nothing = [f"`report-{letter}`\n\nNothing that is stored ran on it yet." for letter in "acd"]
+    assert [each.strip() for each in (first, *rest)] == nothing
+    assert "| `standard` | 10 | 0.50" in second
+    assert "mechsearch evaluate report-a --out rows" in text
+
+
+def test_simulators_are_told_apart():
+    lines = [line(2, 0.9), line(2, 0.9) | {"simulator": "NativeSimulator"}]
+    rows = [row for row in set_pages.rate_tables(lines)["Retrieved"].splitlines() if row.startswith("| `")]
+    assert [row.split(" | ")[0] for row in rows] == ["| `standard`", "| `standard`, in `NativeSimulator`"]
+
+
+def test_no_line_hides_another():
+    with pytest.raises(InputError, match=r"some-run\.jsonl: two lines with 2 objects read '`standard`'"):
+        set_pages.rate_tables([line(2, 0.9), line(2, 0.8)])
+
+
+def test_what_a_run_did_not_judge_has_no_table():
+    unjudged = line(2, 0.9) | {"retrieved": None}
+    unjudged["on_scenes_not_chosen_on"]["retrieved"] = None
+    assert set(set_pages.rate_tables([unjudged])) == {"Found", "Graspable"}
+
+
+def test_a_variant_says_what_differs():
+    settings = {"actions": ["push"], "recognition": "masks", "rehearsal": "none"}
+    assert set_pages.label(line(2, 0.9, **settings)) == "`standard`, `masks`, push alone, without trials"
+    settings = {"actions": ["push", "pick-and-place"], "rehearsal": "learning"}
+    words = "push and pick-and-place alone, with trials that learn the friction"
+    assert set_pages.label(line(2, 0.9, **settings)) == f"`standard`, {words}"
+
+
+def test_the_baseline_of_the_guide_to_many_variants_is_one_of_them():
+    guide = (ROOT / "docs/scale.md").read_text(encoding="utf-8")
+    gammas, policies = re.findall(r"mechsearch sweep .*--gamma ([\d. ]+) --policy ([\w -]+?) --out", guide)[0]
+    (baseline,) = re.findall(r"mechsearch report .*--baseline (\S+)", guide)
+    configs = [USUAL.config.with_options(gamma=float(gamma)) for gamma in gammas.split()]
+    methods = [Method(policy, config) for policy in policies.split() for config in configs]
+    rows = [row_of("development-2-000", method) for method in methods]
+    assert Key.of(rows).named(baseline) == "random, gamma 0.9"
+
+
+@pytest.mark.parametrize("name", method_pictures.PICTURES)
+def test_the_pictures_of_the_method_are_of_the_shipped_scene(name):
+    with Image.open(ROOT / method_pictures.OUT / f"{name}.png") as picture:
+        shows = picture.text[method_pictures.SHOWS]
+    today = load_scenario(example_scenarios()[method_pictures.SCENE]).content_hash
+    assert shows == today, f"run `python -m {method_pictures.__name__}`"
+    assert f"](pictures/{name}.png)" in (ROOT / "docs/pictures.md").read_text(encoding="utf-8")
+
+
+def test_a_recording_of_another_scene_is_refused(tmp_path, monkeypatch):
+    save_recording(RECORDING, tmp_path / "recording.npz")
+    monkeypatch.setattr(sys, "argv", ["method_pictures", "--recording", str(tmp_path / "recording.npz")])
+    with pytest.raises(SystemExit, match=r"recording\.npz: is of another scene than crowded-shelf; [^\n]*$"):
+        method_pictures.main()
+
+
+def test_a_recording_of_the_scene_is_taken():
+    scenario = load_scenario(example_scenarios()[method_pictures.SCENE])
+    world = from_scenario(scenario)
+    for shift, accepted in ((0.001, True), (0.05, False)):
+        first = dataclasses.replace(RECORDING.steps[0], world=world.replace(position=world.position + shift))
+        recording = dataclasses.replace(RECORDING, steps=(first,))
+        if accepted:
+            method_pictures.check_scene(recording, scenario, Path("a.npz"))
+        else:
+            with pytest.raises(InputError, match="another scene"):
+                method_pictures.check_scene(recording, scenario, Path("a.npz"))
+
+
+def test_steps_that_are_left_out_are_counted():
+    figure = method_pictures.steps(dataclasses.replace(RECORDING, steps=RECORDING.steps * 3))
+    assert figure.get_suptitle() == "The first 6 of 9 steps"
+    assert not method_pictures.steps(RECORDING).get_suptitle()
