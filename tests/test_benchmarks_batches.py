@@ -227,13 +227,13 @@ class QuickStage(Stage):
 @pytest.mark.parametrize("how", ["batch", "worker"])
 def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
     """The real policy, with all that is continuous; in worker processes as in batches."""
-    traced, real = [], policies.Rollout
+    traced, real = [], policies.PlanningPolicy.rollout
 
-    def rollout(problem, belief, config, *slots):
-        traced.append(config.sequences)
-        return real(problem, belief, config, *slots)
+    def rollout(policy, problem, belief):
+        traced.append(policy.config.sequences)
+        return real(policy, problem, belief)
 
-    monkeypatch.setattr(policies, "Rollout", rollout)
+    monkeypatch.setattr(policies.PlanningPolicy, "rollout", rollout)
     monkeypatch.setattr(batches, "new_simulator", QuickStage)
     names = ("gamma", "guided_fraction", "unseen_contact_penalty", "crowding_weight")
     crowding = (0.0, 0.01, 0.02, 0.05)

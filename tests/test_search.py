@@ -37,7 +37,8 @@ from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.session.images import converted
+from mechsearch_jax.session.faults import image_warnings, placement_warnings
+from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.searcher import DRAWS, Searcher
 from mechsearch_jax.session.state import beginning
 from mechsearch_jax.session.step import Motion
@@ -137,14 +138,19 @@ def test_what_does_not_tell_the_target_is_a_warning():
     searcher = Searcher()
     searcher.problem = types.SimpleNamespace(camera=CAMERA, shelf=SHELF, target=Target())
     unseen = Observation(empty(8), jnp.array(False), jnp.zeros(3))
-    assert searcher._faults(IMAGES.depth, IMAGES.colour, None, None, unseen) == []
+
+    def warnings(colour, mask=None, target_id=None):
+        images = Images(IMAGES.depth, colour, mask, target_id)
+        return image_warnings(searcher.problem, searcher.recogniser, images, unseen)
+
+    assert warnings(IMAGES.colour) == []
     red = np.where((IMAGES.mask == 0)[..., None], np.uint8([[[200, 10, 10]]]), IMAGES.colour)
-    (fault,) = searcher._faults(IMAGES.depth, red, None, None, unseen)
+    (fault,) = warnings(red)
     assert "pixels have the target's colour, but nothing that shows them has its shape and size" in fault
-    assert searcher._faults(IMAGES.depth, red, IMAGES.mask, None, unseen) == []
-    (fault,) = searcher._faults(IMAGES.depth, None, None, None, unseen)
+    assert warnings(red, IMAGES.mask) == []
+    (fault,) = warnings(None)
     assert fault.startswith("images: the target cannot be told from the objects")
-    (fault,) = searcher._faults(IMAGES.depth, None, IMAGES.mask, 8, unseen)
+    (fault,) = warnings(None, IMAGES.mask, 8)
     assert fault.startswith("mask: no pixel holds the target's number 8")
 
 
@@ -178,10 +184,9 @@ def uncalled(problem):
 
 
 def placement_of(camera, calibration=None):
-    """What a searcher with a camera warns of in the example's depth; it has no constants to decide with."""
-    searcher = Searcher(Workcell(calibration=calibration or CalibrationLimits()))
-    searcher.problem = types.SimpleNamespace(camera=camera, shelf=SHELF)
-    return searcher._placement_faults(IMAGES.depth)
+    """What is said of the example's depth where it is taken by a camera."""
+    setting = types.SimpleNamespace(camera=camera, shelf=SHELF, target=Target())
+    return placement_warnings(setting, calibration or CalibrationLimits(), IMAGES.depth)
 
 
 LAX = CalibrationLimits(refuse_shift=0.03)

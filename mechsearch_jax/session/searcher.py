@@ -20,7 +20,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -28,23 +27,12 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.belief.impasse import impasse
-from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.overlaps import overlap_faults
-from mechsearch_jax.perception.plausibility import (
-    EMPTY_SHELF,
-    check_measured,
-    colour_faults,
-    detection_faults,
-    identity_faults,
-    image_faults,
-    sight_faults,
-)
-from mechsearch_jax.perception.recogniser import Recogniser, check_images
+from mechsearch_jax.perception.plausibility import EMPTY_SHELF
+from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.learning import LearnedFriction, restored
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
@@ -56,14 +44,14 @@ from mechsearch_jax.robot.hand import checked_width
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
-from mechsearch_jax.session import warming
+from mechsearch_jax.session import faults, warming
 from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.slots import UNTRIED, filled, tries_nothing
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import Motion, Present, SearchStep, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
-from mechsearch_jax.workspace.sight import camera_faults, check_camera
+from mechsearch_jax.workspace.sight import check_camera
 
 # Reachable share of the candidate poses below which `check` warns.
 LEAST_REACH = 0.5
@@ -178,7 +166,7 @@ class Searcher:
         """Check that the arm reaches into the shelf, the camera sees it, and the networks know such views."""
         poses = self.problem.poses.shape[0]
         reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
-        warnings = list(self._camera_faults)
+        warnings = list(self._view_warnings)
         if reach == 0.0:
             warnings.insert(0, NOWHERE)
         elif reach < LEAST_REACH:
@@ -239,7 +227,7 @@ class Searcher:
 
     def _twin(self) -> Searcher:
         """A copy of this searcher at the beginning of its search, for which no recognition is too doubtful to move."""
-        _ = self._camera_faults
+        _ = self._view_warnings
         twin = copy.copy(self)
         twin._state = beginning(self.problem)
         twin._trajectories = dataclasses.replace(self._trajectories or TrajectoryConfig(), doubt=warming.TRUSTING)
@@ -285,18 +273,14 @@ class Searcher:
         step_key = jax.random.fold_in(jax.random.key(self._seed), now.index)
         # With the same key, a refused action would be drawn again.
         recognition_key, decision_key = jax.random.split(jax.random.fold_in(step_key, now.refusals))
-        depth, colour, mask, target_id = converted(depth, colour, mask, target_id)
-        if joints is not None:
-            joints = np.asarray(joints, float)
-            check_joints("joints", joints)
-        width = None if width is None else checked_width(width, problem.gripper.max_opening)
-        observation, warnings, shelf_is_empty = self._seen(recognition_key, depth, colour, mask, target_id)
+        images, present = converted(depth, colour, mask, target_id), self._present(joints, width)
+        observation, warnings, shelf_is_empty = self._seen(recognition_key, images)
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        warnings += belief_faults(now.belief, belief, shelf_is_empty=shelf_is_empty)
+        warnings += faults.belief_warnings(now.belief, belief, shelf_is_empty=shelf_is_empty)
         learned = self._learned(observation)
         trials = self._trials if learned is None else learned.trials([0])
-        decision, motion = self._decide(decision_key, trials, belief, observation, depth, Present(joints, width))
+        decision, motion = self._decide(decision_key, trials, belief, observation, images.depth, present)
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -309,36 +293,50 @@ class Searcher:
             belief=belief,
             decision=decision,
             problem=problem,
-            image=display_image(depth, colour),
+            image=display_image(images.depth, images.colour),
         )
-        handed = motion.trajectory is not None
-        refusals = now.refusals + (not handed)
-        latest = now.index, belief, observation, decision.action
-        self._state = State(
-            *latest,
-            handed=handed,
-            acted=False,
-            finished=False,
-            refusals=refusals,
-            hypothesis_probabilities={} if learned is None else learned.first,
-        )
+        self._keep(step, learned)
         return step
 
-    def _seen(
-        self, key: Array, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None
-    ) -> tuple[Observation, list[str], bool]:
+    def _seen(self, key: Array, images: Images) -> tuple[Observation, list[str], bool]:
         """What is recognised in images, warnings about them, and whether they show an empty shelf.
 
         Raises:
           InputError: as `next`.
         """
         problem = self.problem
-        misplaced = self._placement_faults(depth)
-        observation = self.recogniser(key, depth, colour, mask, target_id).judged()
-        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id, observation)]
-        unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
-        warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
-        return observation, warnings, EMPTY_SHELF in unseen
+        misplaced = faults.placement_warnings(problem, self.workcell.calibration, images.depth)
+        observation = self.recogniser(key, *images).judged()
+        of_images = faults.image_warnings(problem, self.recogniser, images, observation)
+        of_objects = faults.recognition_warnings(problem, images.depth, observation)
+        warnings = [*self._view_warnings, *misplaced, *of_images, *of_objects]
+        return observation, warnings, EMPTY_SHELF in of_objects
+
+    def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
+        """Keep of a step what the next one needs."""
+        handed = step.trajectory is not None
+        self._state = State(
+            step.index,
+            step.belief,
+            step.observation,
+            step.decision.action,
+            handed=handed,
+            acted=False,
+            finished=False,
+            refusals=self._now.refusals + (not handed),
+            hypothesis_probabilities={} if learned is None else learned.first,
+        )
+
+    def _present(self, joints: Any, width: Any) -> Present:
+        """Arm and hand, as `next` is given them.
+
+        Raises:
+          InputError: as `next`.
+        """
+        if joints is not None:
+            joints = np.asarray(joints, float)
+            check_joints("joints", joints)
+        return Present(joints, None if width is None else checked_width(width, self.problem.gripper.max_opening))
 
     def _learned(self, observation: Observation) -> LearnedFriction | None:
         """What trials have learned from all executed actions, with the last images; None if they do not learn.
@@ -437,62 +435,10 @@ class Searcher:
         self._state = state
 
     @functools.cached_property
-    def _camera_faults(self) -> tuple[str, ...]:
-        """Warnings about the camera's pose and its distance from the views that the networks were trained on."""
-        faults = camera_faults(self.workcell.camera, self.workcell.shelf)
-        recogniser = self.recogniser
-        # Another recogniser may have other networks, or none.
-        if faults or not isinstance(recogniser, Recogniser):
-            return faults
-        return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
-
-    def _placement_faults(self, depth: np.ndarray) -> tuple[str, ...]:
-        """Warnings about where the shelf is in a depth image; they need no recogniser.
-
-        Raises:
-          InputError: the image cannot be used.
-        """
-        camera, shelf = self.problem.camera, self.problem.shelf
-        check_images(camera, depth)
-        check_measured(camera, shelf, depth)
-        return placement_faults(camera, shelf, depth, self.workcell.calibration)
-
-    def _faults(
-        self, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None, observation: Observation
-    ) -> list[str]:
-        """Warnings about images that do not fit camera, shelf and target; the observation is of them."""
-        problem, recogniser = self.problem, self.recogniser
-        mask, colour = (None if image is None else np.asarray(image) for image in (mask, colour))
-        faults = list(image_faults(problem.camera, problem.shelf, depth, mask))
-        # Another recogniser may identify the target in another way.
-        if isinstance(recogniser, Recogniser):
-            faults += identity_faults(colour, mask, target_id)
-            if colour is not None and target_id is None:
-                detector = recogniser.detector
-                faults += colour_faults(problem.camera, problem.shelf, problem.target, detector, depth, colour)
-                if mask is None:
-                    faults += detection_faults(problem.camera, problem.shelf, detector, depth, colour, observation)
-        return faults
+    def _view_warnings(self) -> tuple[str, ...]:
+        return faults.view_warnings(self.workcell, self.recogniser)
 
     @functools.cached_property
     def _digest(self) -> str:
         """SHA-256 of everything that a saved state depends on; not of the hand, nor of the target's place."""
         return hashlib.sha256(repr((self.workcell, self.config, self._seed)).encode()).hexdigest()
-
-
-def belief_faults(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:
-    """Warnings about what a look made of the belief; on an empty shelf f becomes empty, and nothing is wrong."""
-    faults = []
-    if int(after.restarts) > int(before.restarts) and not shelf_is_empty:
-        faults.append("f became empty and was started anew: something moved that was not seen, or a shape is wrong")
-    if bool(before.found) and not bool(after.found):
-        faults.append("the target is not where it was found any more: it is searched for anew")
-    return faults
-
-
-def crowd_faults(observation: Observation) -> list[str]:
-    """A warning if every slot for objects is taken."""
-    slots = observation.objects.capacity
-    if not bool(jnp.all(observation.objects.valid)):
-        return []
-    return [f"recognition: all {slots} slots are taken; objects beyond the largest {slots} are not seen"]
