@@ -311,7 +311,7 @@ def pages(results: PathLike) -> dict[str, str]:
 
 
 def main() -> None:
-    """Rewrite the pages, and the pictures if asked."""
+    """Rewrite the pages, with `--pictures` the pictures, too."""
     parser = argparse.ArgumentParser(description=f"Write {OUT} from the declared scene sets and the stored runs.")
     parser.add_argument("--results", default=RESULTS, type=Path, help="folder of stored results")
     parser.add_argument("--out", default=OUT, type=Path, help="folder of the pages")
