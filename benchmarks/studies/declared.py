@@ -1,7 +1,6 @@
 """The studies that there are.
 
-Ablations run on `development`, since they choose what the default has; baselines and robustness on scenes that nothing
-was chosen on.
+Ablations run on `development`, since they choose what the default has; all others on scenes that nothing was chosen on.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.world.mismatch import Mismatch
 
 ABLATION_SCENES, REPORT_SCENES = "development", "report-a"
+# A set for each later question, since a set that was looked at is no longer unseen.
+IMAGE_SCENES, CONFIRMATION_SCENES = "report-b", "report-c"
 _VIEWS = Path(__file__).parents[1] / "parts" / "views"
 STANDARD = Variant("standard")
 
@@ -162,6 +163,39 @@ _ABLATIONS = (
     ),
 )
 
+# What gained nothing on `development`, each by itself, and could be left out of the default.
+_LEFT_OUT = {"reopen": False, "closer_look": 0, "erosion": 0.0, "cell_reach": (0.5,), "move_target": False}
+
+_CONFIRMATIONS = (
+    Study(
+        "images",
+        "What does it cost to see images instead of true shapes, on scenes that nothing was chosen on?",
+        IMAGE_SCENES,
+        (
+            Variant("oracle"),
+            Variant("masks", {"recognition": "masks"}),
+            Variant("full", {"recognition": "full"}),
+        ),
+    ),
+    Study(
+        "confirmation",
+        "Which differences of the ablations hold on scenes that nothing was chosen on?",
+        CONFIRMATION_SCENES,
+        (
+            STANDARD,
+            Variant("20 actions", {"max_steps": 20}),
+            Variant("horizon 1", {"horizon": 1}),
+            Variant("horizon 1, 300 sequences", {"horizon": 1, "sequences": 300}),
+            Variant("gamma 0.5", {"gamma": 0.5}),
+            Variant("300 sequences", {"sequences": 300}),
+            Variant("f never reopened", {"reopen": False}),
+            Variant("what gained nothing left out", _LEFT_OUT),
+            Variant("full", {"recognition": "full"}),
+            Variant("full, what gained nothing left out", {"recognition": "full", **_LEFT_OUT}),
+        ),
+    ),
+)
+
 _BASELINES = (
     Study(
         "baselines",
@@ -303,6 +337,7 @@ def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
 # By what they are for, in the order of the page.
 GROUPS: Mapping[str, Sequence[Study]] = {
     "Ablations": _ABLATIONS,
+    "On new scenes": _CONFIRMATIONS,
     "Baselines": _BASELINES,
     "Robustness": _ROBUSTNESS,
 }
