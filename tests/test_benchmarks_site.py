@@ -10,7 +10,7 @@ from PIL import Image
 from recordings import RECORDING
 from stored_rows import USUAL, row_of
 
-from mechsearch_jax.benchmarks.site import method_pictures, set_pages
+from mechsearch_jax.benchmarks.site import all_pages, method_pictures, set_pages
 from mechsearch_jax.benchmarks.site.set_texts import ABOUT, sets_of
 from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.envs.episode.method import Method
@@ -200,3 +200,18 @@ def test_steps_that_are_left_out_are_counted():
     figure = method_pictures.steps(dataclasses.replace(RECORDING, steps=RECORDING.steps * 3))
     assert figure.get_suptitle() == "The first 6 of 9 steps"
     assert not method_pictures.steps(RECORDING).get_suptitle()
+
+
+def test_one_command_writes_every_page_that_the_docs_name():
+    text = (ROOT / "docs/commands.md").read_text() + (ROOT / "docs/studies.md").read_text()
+    named = set(re.findall(r"`python -m (mechsearch_jax\.benchmarks\.[a-z_.]+(?:page|pages|seconds))\b", text))
+    assert named - {all_pages.__name__} == {write.__module__ for write in all_pages.PAGES.values()}
+
+
+def test_outside_a_checkout_nothing_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        all_pages.main([])
+    assert end.value.code == 2
+    assert "give the folder of the stored results as --results" in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())

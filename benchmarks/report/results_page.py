@@ -225,9 +225,9 @@ def page(folder: PathLike) -> str:
     return TEMPLATE.read_text(encoding="utf-8").format_map(stored)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Rewrite the page."""
-    rewrite(page, "results", "benchmarks/results", "docs/results.md")
+    rewrite(page, "results", "benchmarks/results", "docs/results.md", arguments)
 
 
 if __name__ == "__main__":

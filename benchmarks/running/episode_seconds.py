@@ -203,11 +203,11 @@ def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]
     ]
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Write the file."""
     parser = argparse.ArgumentParser(description="Write how long episodes took, from the stored runs.")
     parser.add_argument("--results", default=str(RUNS.parent), help="folder of the stored results")
-    folder = Path(parser.parse_args().results)
+    folder = Path(parser.parse_args(arguments).results)
     try:
         lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries(folder, stored_runs(folder / RUNS.name)))
         with replacing(FILE) as file:

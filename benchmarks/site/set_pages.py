@@ -310,29 +310,29 @@ def pages(results: PathLike) -> dict[str, str]:
     return {"index.md": index_page(lines), **{f"{name}.md": page(name, lines, results) for name in ABOUT}}
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Rewrite the pages, with `--pictures` the pictures, too."""
     parser = argparse.ArgumentParser(description=f"Write {OUT} from the declared scene sets and the stored runs.")
     parser.add_argument("--results", default=RESULTS, type=Path, help="folder of stored results")
     parser.add_argument("--out", default=OUT, type=Path, help="folder of the pages")
     parser.add_argument("--pictures", action="store_true", help="draw the pictures, too")
-    arguments = parser.parse_args()
-    if not (arguments.results / "runs").is_dir():
-        parser.error(f"{arguments.results}: holds no runs; start it at the root of a checkout, or give --results")
+    given = parser.parse_args(arguments)
+    if not (given.results / "runs").is_dir():
+        parser.error(f"{given.results}: holds no runs; start it at the root of a checkout, or give --results")
     try:
-        texts = pages(arguments.results)
+        texts = pages(given.results)
     except InputError as error:
         raise SystemExit(str(error)) from error
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    given.out.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
-        with replacing(arguments.out / name) as file:
+        with replacing(given.out / name) as file:
             file.write(text.encode())
-    if arguments.pictures:
+    if given.pictures:
         from mechsearch_jax.benchmarks.site.set_pictures import draw
 
         for name, about in ABOUT.items():
             if about.shown:
-                draw(blocks_shown(SETS[name], about), arguments.out / f"{name}.png")
+                draw(blocks_shown(SETS[name], about), given.out / f"{name}.png")
 
 
 if __name__ == "__main__":

@@ -212,9 +212,9 @@ def page(folder: PathLike) -> str:
     return TEMPLATE.read_text(encoding="utf-8").format_map(computed(Stored(folder)))
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Rewrite the page."""
-    rewrite(page, "results", "benchmarks/results", "docs/costs.md")
+    rewrite(page, "results", "benchmarks/results", "docs/costs.md", arguments)
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def page(compared: Mapping[str, ShownStudy]) -> str:
     return as_markdown(parts)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Rewrite the pages and their pictures."""
     parser = argparse.ArgumentParser(
         description="Write docs/studies.md, docs/yardstick.md and their pictures from the stored runs."
@@ -81,19 +81,19 @@ def main() -> None:
     parser.add_argument(
         "--out", default="docs/studies.md", type=Path, help="the page; the other one and all pictures come beside it"
     )
-    arguments = parser.parse_args()
+    given = parser.parse_args(arguments)
     try:
-        if not arguments.runs.is_dir():
-            raise InputError(f"{arguments.runs}: is no folder; start it at the root of a checkout, or give --runs")
-        runs = stored_runs(arguments.runs)
+        if not given.runs.is_dir():
+            raise InputError(f"{given.runs}: is no folder; start it at the root of a checkout, or give --runs")
+        runs = stored_runs(given.runs)
     except InputError as error:
         parser.error(str(error))
     compared = shown(runs)
     figures = {name: picture(each.study, each.comparisons) for name, each in compared.items()}
-    _write(arguments.out, page(compared), figures)
+    _write(given.out, page(compared), figures)
     if YARDSTICK.study in compared:
         measured = measure(compared[YARDSTICK.study])
-        out = arguments.out.with_name(yardstick_page.PAGE)
+        out = given.out.with_name(yardstick_page.PAGE)
         _write(out, yardstick_page.page(measured), yardstick_page.pictures(measured))
 
 
