@@ -357,14 +357,23 @@ def test_the_times_of_a_decision_are_the_stored_ones():
 
 
 def test_what_is_retrieved_from_images_is_what_is_stored():
-    run = load_run(RESULTS / "runs", "table1-full-h100")
-    wanted = {"preset": "standard", "settings": {"recognition": "full"}}
-    lines = [line for line in run.lines if {name: line[name] for name in wanted} == wanted]
-    new = {line["objects"]: line["on_scenes_not_chosen_on"]["retrieved"]["rate"] for line in lines}
-    assert list(new) == [2, 4, 6, 8]
-    two, four, six, eight = (f"{rate:.2f}" for rate in new.values())
-    stated = f"[{two}, {four}, {six} and {eight} are retrieved](docs/results.md#from-images)"
-    assert stated in " ".join(read("README.md").split())
+    readme = " ".join(read("README.md").split())
+    rates = {
+        (name, recognition): [
+            f"{line['retrieved']['rate']:.2f}"
+            for line in load_run(RESULTS / "runs", name).lines
+            if (line["preset"], line["settings"]) == ("standard", settings)
+        ]
+        for name in ("images-h200", "confirmation-h200")
+        for recognition, settings in (("full", {"recognition": "full"}), ("oracle", {}))
+    }
+    assert {len(each) for each in rates.values()} == {4}
+    two, four, six, eight = rates["images-h200", "full"]
+    assert f"[{two}, {four}, {six} and {eight} are retrieved](docs/results.md#from-images) of 200" in readme
+    two, four, six, eight = rates["confirmation-h200", "full"]
+    assert f"and {two}, {four}, {six} and {eight} of 100 each on `report-c`" in readme
+    true = " and ".join(", ".join(rates[name, "oracle"]) for name in ("images-h200", "confirmation-h200"))
+    assert f"true shapes retrieve {true};" in readme
 
 
 def test_what_came_of_searches_in_a_cell_is_what_is_stored():

@@ -27,7 +27,7 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Without -h100.
-IMAGE_RUNS = ("table1", "table1-full", "seeds", "collision-free")
+IMAGE_RUNS = ("table1-h100", "seeds-h100", "collision-free-h100", "images-h200", "confirmation-h200")
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -66,7 +66,7 @@ def table(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 def with_objects(episodes: Iterable[Episode], count: int) -> list[Episode]:
     """The episodes whose scenes, `SET-OBJECTS-NUMBER`, have a number of objects."""
-    return [episode for episode in episodes if episode["scenario"].split("-")[1] == str(count)]
+    return [episode for episode in episodes if episode["scenario"].split("-")[-2] == str(count)]
 
 
 def reached(episodes: Sequence[Episode], key: str) -> list[bool]:
@@ -171,14 +171,30 @@ def _on_new_scenes(runs: Iterable[StoredRun], method: Method) -> list[Episode]:
     return [vars(row) for row in rows if all(options_of(row).get(name) == value for name, value in settings.items())]
 
 
-def from_images(table1: StoredRun, full: StoredRun, seeds: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
-    """The episodes of the default from images, by what they ran with."""
+def from_images(
+    table1: StoredRun, seeds: StoredRun, collision_free: StoredRun, images: StoredRun, confirmation: StoredRun
+) -> dict[str, Any]:
+    """The fields of the template about the default from images."""
     usual = Method(recognition="masks")
     grasps = dataclasses.replace(usual, config=usual.config.with_options(retrieval_contact=False))
-    return {
+    full = dataclasses.replace(usual, recognition="full")
+    groups = {
         "`masks`, 4 seeds": _on_new_scenes([table1, seeds], usual),
         "`masks`, collision-free grasps only, 4 seeds": _on_new_scenes([collision_free], grasps),
-        "`full`, 1 seed": _on_new_scenes([full], dataclasses.replace(usual, recognition="full")),
+        "`full`, `report-b`, 2 seeds": _on_new_scenes([images], full),
+    }
+    others = {
+        "images_true": (images, Method()),
+        "others_full": (confirmation, full),
+        "others_true": (confirmation, Method()),
+    }
+    retrieved = {
+        name: [reached(with_objects(_on_new_scenes([run], method), count), "retrieved") for count in COUNTS]
+        for name, (run, method) in others.items()
+    }
+    return {
+        "image_rates": rates("recognition", groups),
+        **{name: ", ".join(map(share, flags)) for name, flags in retrieved.items()},
     }
 
 
@@ -190,7 +206,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "new: `c2` 090 to 179": [each for each in new["episodes"] if not is_chosen_on(each["scenario"])],
         "development: published": published["episodes"],
     }
-    runs = [load_run(stored.folder / "runs", f"{name}-h100") for name in IMAGE_RUNS]
+    runs = [load_run(stored.folder / "runs", name) for name in IMAGE_RUNS]
     clock = new["clock"]["nothing kept"]
     frictions = {"same": "X1", "half": "X5", "double": "X2"}
     starts = stored["scenes-start-cpu"]["summary"]
@@ -198,8 +214,8 @@ def computed(stored: Stored) -> dict[str, Any]:
         **{"new": new, "published": published, "paper": paper},
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps(default),
-        **{name.replace("-", "_"): run.lines[0] for name, run in zip(IMAGE_RUNS, runs, strict=True)},
-        "image_rates": rates("recognition", from_images(*runs)),
+        **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(IMAGE_RUNS, runs, strict=True)},
+        **from_images(*runs),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),
