@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -81,6 +82,14 @@ def test_an_impossible_camera_is_refused_as_before(wrong, message):
     assert str(caught.value) == message
 
 
+@pytest.mark.parametrize("huge", [1e160, 1e300, float("inf")])
+def test_a_rotation_of_huge_numbers_is_refused_without_a_warning(huge):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match="must be a rotation matrix"):
+            Camera(rotation=((huge, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+
 def test_what_was_kept_on_disk_is_found_for_another_pose(tmp_path):
     traced = []
 
@@ -99,6 +108,7 @@ def test_what_was_kept_on_disk_is_found_for_another_pose(tmp_path):
     assert not np.array_equal(first, second)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_traced_gives_what_a_constant_does(problem):
     settings = problem.config.existence
     tables = existence_tables(NEW, problem.shelf, problem.target, settings)

@@ -66,7 +66,9 @@ class Camera:
         for name in ("cx", "cy"):
             check_range(f"Camera: {name}", getattr(self, name), -10 * LARGEST, 10 * LARGEST, "pixels")
         rotation = np.array(self.rotation, float)
-        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+        # Products of numbers far above 1 may overflow.
+        small = rotation.shape == (3, 3) and bool((np.abs(rotation) < 2.0).all())
+        if not small or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
             raise InputError("Camera: rotation must be a rotation matrix, three orthonormal rows")
         if np.linalg.det(rotation) < 0:
             raise InputError("Camera: rotation mirrors; its columns are the camera's x, y and z, a right-handed frame")
