@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import zlib
 from pathlib import Path
 
 # Two thirds of the tests' time is XLA's, and most of that is spent on making fast what runs once. XLA reads this when
@@ -34,6 +33,7 @@ runtime_checks.install("mechsearch_jax")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+import shares  # noqa: E402
 from xdist.scheduler import LoadScopeScheduling  # noqa: E402
 
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or os.path.join(tempfile.gettempdir(), "mechsearch-jax-tests")
@@ -119,12 +119,6 @@ def commit(folder=Path(__file__).parent):
     return done.stdout.strip()
 
 
-def part_of_each(nodeids, parts):
-    """To which of the parts, counted from 1, each slow test belongs: shuffled by name, and as many to each part."""
-    shuffled = sorted(nodeids, key=lambda nodeid: (zlib.crc32(nodeid.encode()), nodeid))
-    return {nodeid: i % parts + 1 for i, nodeid in enumerate(shuffled)}
-
-
 def pytest_configure(config):
     if config.getoption("slow_share"):
         # Every process has to select the same tests, so that the part is chosen once.
@@ -138,10 +132,13 @@ def pytest_report_header(config):
 
 
 class ByGroup(LoadScopeScheduling):
-    """Gives each group of files to one process, in the order in which they were collected."""
+    """Gives each group of files to one process, in the order in which they were collected; of a part of the slow tests,
+    which is balanced by file, each file."""
 
     def _split_scope(self, nodeid):
         file = Path(nodeid.partition("::")[0]).stem
+        if self.config.getoption("slow_share"):
+            return file
         return next((group for group, files in GROUPS.items() if file in files), file)
 
 
@@ -156,11 +153,13 @@ def pytest_xdist_make_scheduler(config, log):
 def pytest_collection_modifyitems(config, items):
     if config.getoption("slow_share"):
         part, parts = share_of(config.getoption("slow_share"))
-        part_of = part_of_each([item.nodeid for item in items if item.get_closest_marker("slow")], parts)
+        part_of = shares.part_of_each([item.nodeid for item in items if item.get_closest_marker("slow")], parts)
         left_out = [item for item in items if part_of.get(item.nodeid, part) != part]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if part_of.get(item.nodeid, part) == part]
     rank = {name: i for i, name in enumerate((*FIRST, *LONG_FIRST))}
+    if config.getoption("slow_share"):
+        rank = {name: i for i, name in enumerate((*FIRST, *shares.longest_first([item.nodeid for item in items])))}
     items.sort(key=lambda item: rank.get(Path(item.path).stem, len(rank)))
 
 

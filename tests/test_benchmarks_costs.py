@@ -28,6 +28,8 @@ def measures():
     return costs_page.Measures.of(Stored(ROOT / "benchmarks/results"))
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_the_page_is_what_is_declared_and_stored():
     written = (ROOT / "docs/costs.md").read_text(encoding="utf-8")
     assert written == costs_page.page(ROOT / "benchmarks/results"), f"run `python -m {costs_page.__name__}`"

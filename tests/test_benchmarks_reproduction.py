@@ -64,6 +64,8 @@ def finding(text):
     return one
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_the_page_is_what_the_stored_runs_say():
     written = (ROOT / "docs/reproduction.md").read_text(encoding="utf-8")
     expected = reproduction_page.page(ROOT / "benchmarks/results/runs")

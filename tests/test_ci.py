@@ -41,6 +41,19 @@ def test_the_site_is_built_so_that_a_broken_link_fails():
     assert "--quiet" not in line
 
 
+def test_what_is_always_run_and_what_is_drawn_are_all_slow_tests_but_those_of_a_release():
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert '"XLA_FLAGS= $always tests/test_readme.py"' in ci
+    assert "&& $always --ignore tests/test_readme.py" in ci
+    (chosen,) = re.findall(r"-m '([^']*)' --slow-share auto/", ci)
+    assert chosen == "slow and not gpu and not release and not always"
+
+
+def test_the_readme_says_how_much_of_the_slow_tests_a_change_has_to_pass():
+    (parts,) = re.findall(r"^PARTS=(\d+) ", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    assert f"one of {parts} parts of the slow tests" in " ".join((ROOT / "README.md").read_text().split())
+
+
 @pytest.fixture
 def release(tmp_path):
     """Runs the command on a checkout of its own, with the Pythons of these versions."""

@@ -177,6 +177,8 @@ def test_the_results_page_is_what_its_stored_results_say():
     assert len(written.splitlines()) <= 150
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_the_page_of_studies_is_what_its_stored_runs_say():
     compared = shown(runs.stored_runs(RESULTS / "runs"))
     assert read("docs/studies.md") == studies_page.page(compared), f"run `python -m {studies_page.__name__}`"

@@ -201,6 +201,8 @@ def test_what_it_is_given_has_to_fit(sim):
     assert isinstance(sim, Simulator)
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_a_push_ends_where_the_native_simulator_has_it_and_other_worlds_stay(sim):
     """One batch: a push, a push out of reach, one that is not to be executed, and one in which the arm is held up."""
     wide = standing("box", (0.078, 0.048, 0.1), 0.6, Shelf().left - 0.078)
@@ -233,6 +235,7 @@ def test_a_push_ends_where_the_native_simulator_has_it_and_other_worlds_stay(sim
         np.testing.assert_array_equal(sim.world.rotation[i], before.rotation[i])
 
 
+@pytest.mark.slow
 def test_every_world_has_its_own_cell(sim):
     moved, heavy = Mismatch(shelf_shift=0.01, shelf_turn=1.0), Mismatch(friction=0.5, mass=2.0)
     cells = {1: moved.drawn(scene(BOX), 0, Camera(), Shelf()), 2: heavy.drawn(scene(BOX), 0, Camera(), Shelf())}

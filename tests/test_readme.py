@@ -48,6 +48,7 @@ def test_the_command_that_made_the_animation_is_beside_it():
 
 
 @pytest.mark.slow
+@pytest.mark.always
 def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys, monkeypatch):
     # The process belongs to all tests, and keeps nothing.
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")

@@ -1,5 +1,8 @@
-"""The share of the slow tests that a run takes: all shares together are all slow tests, and no test is in two."""
+"""The share of the slow tests that a run takes: all shares together are all slow tests, no test is in two, and they
+take about as long as each other."""
 
+import ast
+import json
 import re
 import subprocess
 import sys
@@ -10,6 +13,7 @@ from pathlib import Path
 
 import conftest
 import pytest
+import shares
 
 ROOT = Path(__file__).parents[1]
 
@@ -51,9 +55,59 @@ def selected(share):
 @pytest.mark.parametrize("parts", [1, 3, 8])
 def test_every_slow_test_is_in_one_part(parts):
     every = sorted(item.nodeid for item in collected() if item.slow)
-    shares = [[i.nodeid for i in selected(f"{k}/{parts}") if i.slow] for k in range(1, parts + 1)]
-    assert sorted(nodeid for share in shares for nodeid in share) == every
-    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+    each = [[i.nodeid for i in selected(f"{k}/{parts}") if i.slow] for k in range(1, parts + 1)]
+    assert sorted(nodeid for part in each for nodeid in part) == every
+
+
+def names(file, count):
+    return [f"tests/{file}.py::test_{i}" for i in range(count)]
+
+
+def loads(part_of, parts, seconds):
+    return [sum(shares.seconds_of(n, seconds) for n, p in part_of.items() if p == k) for k in range(1, parts + 1)]
+
+
+def test_parts_take_as_long_as_each_other():
+    seconds = {file: {f"test_{i}": 3.0 + i**2 % 11 for i in range(9)} for file in ("a", "b", "c")}
+    nodeids = [nodeid for file in "abcd" for nodeid in names(file, 9)]
+    part_of = shares.part_of_each(nodeids, 4, seconds)
+    heaviest = max(total for _, total in shares.bundles(nodeids, 4, seconds))
+    total = loads(part_of, 4, seconds)
+    assert max(total) - min(total) <= heaviest <= sum(total) / 8
+    # One that was not measured counts as others do.
+    assert sum(total) == pytest.approx(sum(sum(of.values()) for of in seconds.values()) + 9 * shares.UNKNOWN)
+
+
+def test_what_shares_programs_stays_together_unless_it_takes_too_long():
+    seconds = {"short": {f"test_{i}": 2.0 for i in range(8)}, "long": {f"test_{i}": 20.0 for i in range(8)}}
+    part_of = shares.part_of_each(names("short", 8) + names("long", 8), 2, seconds)
+    assert len({part_of[nodeid] for nodeid in names("short", 8)}) == 1
+    assert {part_of[nodeid] for nodeid in names("long", 8)} == {1, 2}
+
+
+def test_what_takes_longest_comes_first_in_a_part():
+    every = [item.path for item in selected("2/3")]
+    first = dict.fromkeys(every)
+    assert sorted(first, key=lambda path: -every.count(path)) == list(first)
+
+
+def test_what_was_measured_is_a_slow_test():
+    for file, tests in shares.measured().items():
+        tree = ast.parse((ROOT / "tests" / f"{file}.py").read_text())
+        defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        assert {name.partition("[")[0] for name in tests} <= defined, file
+
+
+def test_reports_are_added_to_what_was_measured(tmp_path):
+    path, report = tmp_path / "seconds.json", tmp_path / "slow.xml"
+    path.write_text('{"test_a": {"test_old": 1.0, "test_one[2]": 2.0}}')
+    cases = (
+        '<testcase classname="tests.test_a" name="test_one[2]" time="9.04"/>'
+        '<testcase classname="test_b" name="test_x" time="0.2"/>'
+    )
+    report.write_text(f"<testsuites><testsuite>{cases}</testsuite></testsuites>")
+    shares.write([report], path)
+    assert json.loads(path.read_text()) == {"test_a": {"test_old": 1.0, "test_one[2]": 9.0}, "test_b": {"test_x": 0.2}}
 
 
 def test_other_tests_are_in_every_part(monkeypatch):
