@@ -313,7 +313,7 @@ def test_workers_that_cannot_be_started_end_the_run(tmp_path, files, monkeypatch
     monkeypatch.setitem(sys.modules, "nobody", types.ModuleType("nobody"))
     monkeypatch.setitem(sys.modules, "nobody.there", types.SimpleNamespace(broken=broken))
     with pytest.raises(InputError, match=r"worker processes end while they start: ModuleNotFoundError: .*nobody"):
-        evaluate(make_jobs(files[:2], [Method()], (0,)), tmp_path / "rows", Processes(2, run=broken))
+        evaluate(make_jobs(files[:2], [Method()], (0,)), tmp_path / "rows", Processes(1, run=broken))
     assert read_rows(tmp_path / "rows") == []
 
 

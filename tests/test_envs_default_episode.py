@@ -53,6 +53,7 @@ def check(episode, engine):
     assert (episode.config["rehearsal"], episode.config["simulator"]) == ("physics", engine)
 
 
+@pytest.mark.slow
 def test_what_succeeds_in_physics_is_made_until_the_target_is_out(problem):
     method, decisions = Method(), Decisions()
     assert (target_of(SCENARIO), method.problem_config) == (problem.target, problem.config)

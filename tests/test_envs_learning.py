@@ -176,6 +176,7 @@ def test_what_diverges_does_not_keep_the_others_from_learning():
     assert after.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_slots_learn_between_looks_and_forget(problem):
     slot = OneSlot(
         problem, search_for_grasp(tries=True), lambda key, snapshot: seen(problem, snapshot.world), LearningTrials()

@@ -154,6 +154,7 @@ def beyond(rotation, position, world, slot, points):
     return (np.abs(local) - half).max(axis=1)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_shifted_shifts_recognised_poses():
     masks = recogniser("masks", target_of(SCENE))
     shift = Mismatch(camera_shift=0.03)

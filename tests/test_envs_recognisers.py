@@ -150,6 +150,7 @@ def shown():
     return see
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("y", "in_sight"), [(-0.03, False), (-0.06, True)])
 def test_full_finds_the_target_in_colour_where_it_is_in_sight(world, shown, y, in_sight):
     x, _, z = SCENE.target.position
@@ -164,6 +165,7 @@ def test_full_finds_the_target_in_colour_where_it_is_in_sight(world, shown, y, i
         assert np.sum(named & ~true) < 0.05 * np.sum(true)
 
 
+@pytest.mark.slow
 def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(world, shown):
     image, owner, _ = shown(world)
     nothing = owner == -1
@@ -190,6 +192,7 @@ def test_full_reads_nothing_of_the_truth(world):
         jax.eval_shape(lambda here: masks(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
 
 
+@pytest.mark.slow
 def test_full_sees_the_same_whatever_the_true_segments_are(world, monkeypatch):
     def scrambled(*arguments):
         image = observe(*arguments)

@@ -172,6 +172,7 @@ def test_the_detector_needs_more_than_100_pixels():
     assert int(simulated_camera.target_pixels(camera, world.from_scenario(behind))) == 0
 
 
+@pytest.mark.slow
 def test_eager_jit_and_vmap_agree():
     states = [world.from_scenario(random_scenario(seed, count)) for seed, count in ((0, 3), (1, 8))]
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *states)

@@ -47,9 +47,9 @@ TOWARDS = TOWARDS / np.linalg.norm(TOWARDS)
 ASIDE = np.array([-TOWARDS[1], TOWARDS[0]])
 
 
-@functools.cache
-def detection(detector, threshold):
-    return jax.jit(lambda image: detect(KEY, detector, Target.cylinder(), BOARD, VIEW.camera, image, threshold))
+@functools.partial(jax.jit, static_argnames=("detector", "threshold"))
+def detection(detector, threshold, image):
+    return detect(KEY, detector, Target.cylinder(), BOARD, VIEW.camera, image, threshold)
 
 
 def seen(other, colour, light=LIGHT, detector=None, can=CAN, threshold=6.0):
@@ -60,7 +60,7 @@ def seen(other, colour, light=LIGHT, detector=None, can=CAN, threshold=6.0):
     image = observe(VIEW.camera, world, BOARD, Appearance(colours, jnp.array(light)))
     points = RandomDirection()(KEY, VIEW.camera, image.depth)
     depth = depth_of(VIEW.camera, points)
-    found = detection(detector or TargetColour.lit(), threshold)(ColouredDepth(points, depth, image.colour))
+    found = detection(detector or TargetColour.lit(), threshold, ColouredDepth(points, depth, image.colour))
     return jax.tree.map(np.asarray, found), np.asarray(image.segmentation)
 
 
@@ -85,6 +85,7 @@ def test_without_the_target_nothing_is_detected():
     assert not no_detection(jnp.zeros((3, 4))).visible
 
 
+@pytest.mark.slow
 def test_another_hue_is_not_the_targets():
     found, _ = seen(LARGE, PALETTE[1], detector=TargetColour.lit((0.1, 0.3, 0.8)))
     assert not found.visible
@@ -128,6 +129,7 @@ def test_a_target_that_leans_or_lies_is_detected(axis, degrees):
     assert_on_target(found.pixels & ((owner == TARGET) | (owner < TARGET)), owner)
 
 
+@pytest.mark.slow
 def test_specks_of_the_targets_colour_are_unclear():
     """They are no target, but neither may they be an object that rules out where the target is."""
     x, y = np.array([X, Y]) + 0.09 * TOWARDS + 0.01 * ASIDE

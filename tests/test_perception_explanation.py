@@ -1,5 +1,7 @@
 """Segments that do not explain the image are split, joined or left as they are."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,11 +123,21 @@ def test_no_object_stands_in_a_found_target(explained):
 BOX = (0.03, 0.03, 0.05)
 
 
+@functools.partial(jax.jit, static_argnames="costs")
+def chosen_of(scene, image, united, pixels, costs):
+    """The selection among segments, what the first is split into, and the union of the first two if there is one."""
+    base = jax.tree.map(lambda a: a[:SLOTS], scene)
+    sample = sample_of(jax.random.key(0), image, base, VIEW.camera, SHELF, costs)
+    pair = jnp.zeros(1, int), jnp.ones(1, int)
+    moves = moves_of(jnp.zeros(1, int), jnp.zeros(WAYS, bool), pair, united)
+    return select_objects(scene, moves, sample, pixels, costs)
+
+
 def selection(bodies, shown, unions=(), target=None, costs=None, segmented=None):
     """What is selected of bodies for the first segments and for the first unions, in an image of the bodies `shown`, of
     which the first `segmented`, all if None, have segments."""
     count = 2 * WAYS
-    scene = superquadrics([*bodies], SLOTS + count + len(unions) + 1)
+    scene = superquadrics([*bodies], SLOTS + count + 2)
     absent = np.arange(scene.capacity) >= len(bodies)
     scene = scene.replace(valid=jnp.asarray(~absent))
     for i, body in [*enumerate(unions, SLOTS + count), *([(scene.capacity - 1, target)] if target else [])]:
@@ -143,13 +155,8 @@ def selection(bodies, shown, unions=(), target=None, costs=None, segmented=None)
     owner = np.where(owner < (len(shown) if segmented is None else segmented), owner, OTHER)
     labels = np.where(shows, owner, FREE).astype(np.int8)
     image = LabelledImage(points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.zeros(depth.shape, bool))
-    costs = costs or Costs()
-    base = jax.tree.map(lambda a: a[:SLOTS], scene)
-    sample = sample_of(jax.random.key(0), image, base, camera, SHELF, costs)
-    pair = jnp.zeros(len(unions), int), jnp.ones(len(unions), int)
-    moves = moves_of(jnp.zeros(1, int), jnp.zeros(WAYS, bool), pair, jnp.ones(len(unions), bool))
     pixels = jnp.zeros(SLOTS, int).at[0].set(int(shows.sum()))
-    chosen = select_objects(scene, moves, sample, pixels, costs)
+    chosen = chosen_of(scene, image, jnp.full(1, bool(unions)), pixels, costs or Costs())
     return np.flatnonzero(chosen.selected).tolist(), np.asarray(chosen.margin)
 
 
@@ -163,7 +170,7 @@ def test_a_phantom_in_an_object_is_dropped():
 
 
 def test_the_target_is_priced_like_an_object():
-    shown, target, last = [box(0.0, 0.0, BOX)], box(0.035, 0.0, BOX), SLOTS + 2 * WAYS
+    shown, target, last = [box(0.0, 0.0, BOX)], box(0.035, 0.0, BOX), SLOTS + 2 * WAYS + 1
     cheap, dear = (selection(shown, shown, target=target, costs=Costs(overlap_cost=cost)) for cost in (20.0, 40.0))
     assert cheap[0] == dear[0] == [0, last]
     # It is 2.5 cm in the target, of which 1 cm is recognition's own error.

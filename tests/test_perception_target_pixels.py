@@ -113,6 +113,7 @@ def near(key, shelf, points, of_target):
     return jnp.where(above_board(shelf, points) & close & ~of_target, 0, FREE).astype(jnp.int8)
 
 
+@pytest.mark.slow
 def test_what_the_detector_misses_of_the_target_is_no_object(in_sight):
     colour = in_sight.colour.copy()
     colour[target_patch(in_sight)] = 128

@@ -225,6 +225,7 @@ def test_a_sight_that_was_given_is_what_is_found_without(two):
         _ = beside.view
 
 
+@pytest.mark.slow
 def test_images_are_recognised_by_one_program_for_both(two):
     images = example_images()
     parts = recognising._labelled, explanation.explained_image

@@ -38,10 +38,22 @@ SEGMENTATION = SegmentationConfig(width=32, layers=2, heads=2, neighbours=8, lat
 
 
 @functools.cache
-def parameters(name):
+def drawn(name):
+    """Draws weights, by one program instead of hundreds."""
     network = {"recognition": RECOGNITION, "segmentation": SEGMENTATION}[name]
     task = {"recognition": recognition.RecognitionTask, "segmentation": segmentation.SegmentationTask}[name]
-    return jax.jit(task(network=network).init)(jax.random.key(1))
+    return jax.jit(task(network=network).init)
+
+
+@functools.cache
+def parameters(name):
+    return drawn(name)(jax.random.key(1))
+
+
+@pytest.fixture
+def one_program(monkeypatch):
+    draw = drawn("segmentation")
+    monkeypatch.setattr(segmentation.SegmentationTask, "init", lambda task, key: draw(key))
 
 
 # --- segmentation ----------------------------------------------------------------------------------------------------
@@ -627,6 +639,7 @@ def test_impossible_trainings_are_refused(wrong, reason):
         TrainConfig(**wrong)
 
 
+@pytest.mark.usefixtures("one_program")
 def test_training_begins_with_the_weights_that_it_is_given(tmp_path):
     task, archive = segmentation.SegmentationTask(network=SEGMENTATION), tmp_path / "segmentation.npz"
     save_weights(archive, "segmentation", SEGMENTATION, parameters("segmentation"), {})
@@ -642,6 +655,7 @@ def test_training_begins_with_the_weights_that_it_is_given(tmp_path):
     assert any(jax.tree.leaves(differ))
 
 
+@pytest.mark.usefixtures("one_program")
 def test_weights_of_other_sizes_are_no_beginning():
     with pytest.raises(InputError, match="of other sizes"):
         initial_state(segmentation.SegmentationTask(network=SEGMENTATION), TrainConfig(steps=1, start="shipped"))
