@@ -93,7 +93,7 @@ RECORDING = Recording(
     Target.cylinder(),
     (
         step("1  push", sampled=SAMPLED),
-        step("2  give up", action=None, trace=empty_trace()),
+        step("2  no action", action=None, trace=empty_trace()),
         step("3  take the target out", **FOUND),
     ),
 )

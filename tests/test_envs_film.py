@@ -120,7 +120,7 @@ def test_a_recorder_keeps_what_was_shown_and_what_moved():
             recorder, types.SimpleNamespace(snapshot=snapshot, decision=decision, outcome=outcome), frame
         )
     kept = recorder.recording.__wrapped__(recorder, problem, "how it ended")
-    assert [s.title for s in kept.steps] == ["1  push", "2  give up"]
+    assert [s.title for s in kept.steps] == ["1  push", "2  no action"]
     assert kept.steps[0].trace is one.trace
     np.testing.assert_array_equal(kept.steps[0].sampled.after(1, recorded.scene).position, SAMPLED.position[1])
     assert kept.steps[0].sampled.value.tolist() == [-30.0, -10.0]

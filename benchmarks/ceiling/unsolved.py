@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 from matplotlib.figure import Figure
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets
 from mechsearch_jax.envs.known_target.judgement import Judgement
 from mechsearch_jax.envs.known_target.search import KnownSearchResult, Node
 from mechsearch_jax.envs.recording.pictures import colour_image
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.blockers import Moment, blockers_figure
 
-# Largest number of sets of blocking objects that are listed.
-MAX_LISTED = 3
-
 
 def in_the_way(judgement: Judgement) -> list[tuple[int, ...]]:
     """The minimal sets of objects that feasible grasps hit, the smallest first; empty if no grasp is feasible."""
-    hits = {frozenset(np.flatnonzero(row).tolist()) for row in judgement.hits[judgement.feasible]}
-    minimal = [objects for objects in hits if not any(other < objects for other in hits)]
-    return sorted((tuple(sorted(objects)) for objects in minimal), key=lambda objects: (len(objects), objects))
+    return least_sets(_allowed(judgement))
 
 
 def blockers(judgement: Judgement) -> tuple[int, ...]:
     """The objects that the best grasps hit, those that hit the fewest objects."""
-    sets = in_the_way(judgement)
-    return tuple(sorted({index for objects in sets if len(objects) == len(sets[0]) for index in objects}))
+    return blocking(_allowed(judgement))
+
+
+def _allowed(judgement: Judgement) -> Bool[np.ndarray, "grasps n"]:
+    """What each grasp hits that arm and shelf allow."""
+    return np.asarray(judgement.hits)[np.asarray(judgement.feasible)]
 
 
 def reason(result: KnownSearchResult) -> str:
@@ -58,15 +58,7 @@ def reason(result: KnownSearchResult) -> str:
 
 def _grasps(judgement: Judgement) -> str:
     """The objects that the feasible grasps hit, in words."""
-    if judgement.least is None:
-        return "arm and shelf allow no grasp of the target"
-    sets = in_the_way(judgement)
-    listed = ", or ".join(map(_objects, sets[:MAX_LISTED])) + (", or others" if len(sets) > MAX_LISTED else "")
-    return f"each of the {int(judgement.feasible.sum())} grasps that arm and shelf allow hits {listed}"
-
-
-def _objects(indices: Sequence[int]) -> str:
-    return ("object " if len(indices) == 1 else "objects ") + " and ".join(map(str, indices))
+    return grasps_in_words(_allowed(judgement))
 
 
 def _times(count: int, noun: str) -> str:

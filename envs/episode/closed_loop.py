@@ -24,7 +24,7 @@ from mechsearch_jax.envs.episode.episode_log import (
     takes_target,
     target_trouble,
 )
-from mechsearch_jax.envs.episode.moments import Moment, Watcher
+from mechsearch_jax.envs.episode.moments import Moment, Watcher, nothing_tried
 from mechsearch_jax.envs.episode.numbering import named_decision, named_observation
 from mechsearch_jax.envs.episode.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
 from mechsearch_jax.envs.episode.records import Episode
@@ -285,7 +285,8 @@ class EpisodePool:
         log, bodies = self.running[0].log, np.asarray(slot.truth.bodies)
         decision = named_decision(slot.decision, bodies) if 0 in choices and slot.decision is not None else None
         seen = named_observation(slot.observation, bodies)
-        return Moment(log.index, slot.snapshot, seen, slot.belief, decision, log.steps[-1], None)
+        tried = nothing_tried() if slot.noted is None else slot.noted.tried(bodies)
+        return Moment(log.index, slot.snapshot, seen, slot.belief, decision, log.steps[-1], None, tried)
 
 
 @kept()

@@ -3,13 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode.records import Step
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision
+
+
+class TriedActions(NamedTuple):
+    """The actions that were tried out before one was made, in order, up to the first that succeeded; NumPy arrays.
+
+    Attributes:
+      action: fields with a leading axis K.
+      result: the `TrialResult` of each, shape (K,).
+    """
+
+    action: Action
+    result: Int[np.ndarray, " k"]
+
+
+def nothing_tried() -> TriedActions:
+    """No actions."""
+    return TriedActions(jax.tree.map(lambda a: np.asarray(a)[None][:0], no_action()), np.zeros(0, np.int32))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +46,7 @@ class Moment:
       decision: of the policy, by the same numbers; None where none was needed or none could be acted upon.
       record: what is written down; its `observed_cost` comes later.
       outcome: what the simulator said of the action; None before it was executed, or without one.
+      tried: what trials came to at this step, the objects by the same numbers.
     """
 
     index: int
@@ -33,6 +56,7 @@ class Moment:
     decision: Decision | None
     record: Step
     outcome: Outcome | None
+    tried: TriedActions = dataclasses.field(default_factory=nothing_tried)
 
 
 @runtime_checkable

@@ -160,9 +160,18 @@ def load_episode(path: PathLike) -> Episode:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
     try:
-        return Episode(**{**value, "steps": tuple(_step(step) for step in value["steps"])})
+        return episode_of(value)
     except (TypeError, KeyError) as error:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
+
+
+def episode_of(value: dict[str, Any]) -> Episode:
+    """An episode from its JSON values.
+
+    Raises:
+      TypeError, KeyError: they are of something else.
+    """
+    return Episode(**{**value, "steps": tuple(_step(step) for step in value["steps"])})
 
 
 def _step(value: dict[str, Any]) -> Step:

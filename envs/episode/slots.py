@@ -21,6 +21,7 @@ from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, Truth, true_target_pose, truth_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen
+from mechsearch_jax.envs.episode.noted_trials import NotedTrials
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge, swept_free
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
@@ -112,6 +113,7 @@ class OneSlot:
       decision: of the policy; None between a look and its decision.
       action: the decision's, to be executed before the next look; of kind NONE before the first.
       truth: of the last look, and whether the target was detected at any; None before the first.
+      noted: what the trials of the decision came to; None without trials or a decision.
     """
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
@@ -126,6 +128,7 @@ class OneSlot:
         self.decision: Decision | None = None
         self.action: Action = no_action()
         self.truth: Truth | None = None
+        self.noted: NotedTrials | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
         self._learned = restored(trials, {})
@@ -160,7 +163,7 @@ class OneSlot:
         self.action = no_action()
         truth = truth_of(self._recogniser, snapshot, observation)
         self.truth = truth if self.truth is None else truth.since(self.truth, observation)
-        self.snapshot, self.observation, self.decision = snapshot, observation, None
+        self.snapshot, self.observation, self.decision, self.noted = snapshot, observation, None, None
         belief, seen = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), (self.belief, self.truth))
         return summary(self._problem, belief, seen, in_base(world, self._sensing))
 
@@ -170,7 +173,8 @@ class OneSlot:
             return {}
         assert self.observation is not None
         trials = self._trials if self._learned is None else self._learned.trials([0])
-        self.decision = decide(self._policy, trials, keys[0], self._problem, self.belief, self.observation)
+        self.noted = None if trials is None else NotedTrials(trials)
+        self.decision = decide(self._policy, self.noted, keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
 

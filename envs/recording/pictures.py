@@ -34,7 +34,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
     """A step of an episode, ready to be drawn."""
     record, belief, image = moment.record, moment.belief, moment.snapshot.image
     objects = jax.tree.map(np.asarray, moment.observation.objects)
-    sketch, after, does, why = Sketch(), objects, "give up", "nothing is left to be done"
+    sketch, after, does, why = Sketch(), objects, "no action", "the search ends here"
     if moment.decision is not None and record.action is not None:
         decision, kind = moment.decision, kind_of(int(moment.decision.action.kind))
         after = jax.tree.map(np.asarray, decision.predicted)

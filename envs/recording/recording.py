@@ -17,6 +17,10 @@ from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.episode.moments import Moment
+from mechsearch_jax.envs.episode.records import Episode, episode_of
+from mechsearch_jax.envs.recording.evidence import Evidence, evidence
+from mechsearch_jax.envs.recording.evidence import packed as packed_evidence
+from mechsearch_jax.envs.recording.evidence import unpacked as unpacked_evidence
 from mechsearch_jax.envs.recording.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
 from mechsearch_jax.envs.simulators.simulator import ARM
 from mechsearch_jax.envs.simulators.trace import Trace
@@ -61,6 +65,7 @@ class RecordedStep:
       action: the decision; None if there was none.
       trace: the motion; without rows if nothing moved.
       sampled: the actions that the decision chose from; empty if not recorded.
+      evidence: what lies behind the decision; None if not recorded.
     """
 
     title: str
@@ -75,6 +80,7 @@ class RecordedStep:
     action: Action | None
     trace: Trace
     sampled: Sampled = dataclasses.field(default_factory=nothing_sampled)
+    evidence: Evidence | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -85,6 +91,7 @@ class Recording:
       heading: how it ended, in one sentence.
       camera, shelf, target: of the problem.
       steps: in their order, at least one.
+      episode: its record, `episode.json`; None if not recorded.
     """
 
     heading: str
@@ -92,6 +99,7 @@ class Recording:
     shelf: Shelf
     target: Target
     steps: tuple[RecordedStep, ...]
+    episode: Episode | None = None
 
 
 class Traced(Protocol):
@@ -104,11 +112,12 @@ class Traced(Protocol):
 class Recorder:
     """Collects the steps of an episode that runs alone."""
 
-    def __init__(self, simulator: Traced):
+    def __init__(self, simulator: Traced, problem: Problem | None = None):
         """Args:
         simulator: of the episode.
+        problem: of the episode, for the evidence of decisions; without it there is none.
         """
-        self._simulator = simulator
+        self._simulator, self._problem = simulator, problem
         self._steps: list[RecordedStep] = []
 
     def note(self, moment: Moment, frame: Frame) -> None:
@@ -137,12 +146,13 @@ class Recorder:
                 action=jax.tree.map(np.asarray, moment.decision.action) if acted and moment.decision else None,
                 trace=self._simulator.traces[0] if acted else empty_trace(),
                 sampled=chosen_from,
+                evidence=None if self._problem is None else evidence(moment, self._problem),
             )
         )
 
-    def recording(self, problem: Problem, heading: str) -> Recording:
-        """The recorded steps as a `Recording`."""
-        return Recording(heading, problem.camera, problem.shelf, problem.target, tuple(self._steps))
+    def recording(self, problem: Problem, heading: str, episode: Episode | None = None) -> Recording:
+        """The recorded steps as a `Recording`, with the record of the episode if it is given."""
+        return Recording(heading, problem.camera, problem.shelf, problem.target, tuple(self._steps), episode)
 
 
 def empty_trace() -> Trace:
@@ -165,6 +175,8 @@ def save_recording(recording: Recording, path: PathLike) -> None:
         **{name: dataclasses.asdict(getattr(recording, name)) for name in _SETTINGS},
         "steps": [{name: getattr(step, name) for name in _TEXTS} for step in steps],
     }
+    if recording.episode is not None:
+        head["episode"] = dataclasses.asdict(recording.episode)
     arrays: dict[str, np.ndarray] = {"rows": np.array([len(step.trace.time) for step in steps])}
     arrays["acts"] = np.array([step.action is not None for step in steps])
     for name in _fields(Trace):
@@ -176,6 +188,7 @@ def save_recording(recording: Recording, path: PathLike) -> None:
             arrays[f"{name}.{field}"] = np.stack([np.asarray(getattr(tree, field)) for tree in trees])
     arrays |= {name: np.stack([np.asarray(getattr(step, name)) for step in steps]) for name in _ARRAYS}
     arrays |= packed([step.sampled for step in steps])
+    arrays |= packed_evidence([step.evidence for step in steps], arrays["existence"].shape[1])
     with replacing(path) as file:
         np.savez_compressed(file, allow_pickle=False, head=np.array(json.dumps(head)), **arrays)
 
@@ -193,16 +206,20 @@ def load_recording(path: PathLike) -> Recording:
             raise ValueError("of another kind or version")
         texts, count = head["steps"], len(head["steps"])
         settings = {name: kind(**_tuples(head[name])) for name, kind in _SETTINGS.items()}
-        _check(arrays, count, len(settings["target"].candidate_poses(settings["shelf"])))
+        poses = len(settings["target"].candidate_poses(settings["shelf"]))
+        _check(arrays, count, poses)
         ends = np.cumsum(arrays["rows"])
-        chosen_from = unpacked(arrays, count)
+        more = zip(unpacked(arrays, count), unpacked_evidence(arrays, count, poses), strict=True)
         steps = [
             dataclasses.replace(
-                _step(arrays, texts[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from[i]
+                _step(arrays, texts[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from, evidence=e
             )
-            for i in range(count)
+            for i, (chosen_from, e) in enumerate(more)
         ]
-        return Recording(str(head["heading"]), **settings, steps=tuple(steps))
+        episode = episode_of(head["episode"]) if head.get("episode") is not None else None
+        if episode is not None and len(episode.steps) != count:
+            raise ValueError("its record has another number of steps")
+        return Recording(str(head["heading"]), **settings, steps=tuple(steps), episode=episode)
     except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
         raise InputError(f"{path}: is no recording of an episode ({' '.join(str(error).split())})") from error
 
