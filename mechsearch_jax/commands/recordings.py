@@ -1,4 +1,4 @@
-"""`mechsearch video` and `mechsearch view`: a recorded episode as a film, and in the browser."""
+"""`mechsearch video` and `mechsearch view`: a recorded episode as a film, in the browser, and as a page."""
 
 from __future__ import annotations
 
@@ -58,6 +58,7 @@ def view(
     episode: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     /,
     *,
+    save: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html", help_behavior_hint="")] = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     fps: int = FPS,
@@ -67,6 +68,7 @@ def view(
 
     Args:
       episode: folder of `search --record` or `search --video`.
+      save: instead write a page that explains every decision, one file that needs no server; the others do not matter.
       host: address that is listened at; 0.0.0.0 is every one of this machine, for browsers on others.
       port: of the page; the next free one where it is taken.
       fps: moments in a second.
@@ -78,6 +80,8 @@ def view(
 
     check_option("view", "port", port, 1, 65535)
     check_pace("view", fps, speed)
+    if save is not None:
+        return _save_page(episode, save)
     viser = import_viser()
     recording = recording_of(episode)
     from mechsearch_jax.envs.recording.viewer import Viewer
@@ -97,6 +101,22 @@ def view(
             viewer.run()
     finally:
         server.stop()
+
+
+def _save_page(episode: Path, path: Path) -> None:
+    """Write the page of an episode's folder."""
+    from rich.console import Console
+
+    from mechsearch_jax.envs.page.page import check_page_path, recording_with_record
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
+
+    check_page_path(path)
+    check_recorded(episode)
+    recording = recording_with_record(episode)
+    check_writable(path.parent)
+    keep_compilations()
+    make_page(recording, path, Console(highlight=False))
 
 
 def check_option(command: str, name: str, value: float | int, least: float | int, most: float | int) -> None:
@@ -126,11 +146,22 @@ def recording_of(episode: Path) -> Recording:
       InputError: there is no recording, or it cannot be read.
     """
     from mechsearch_jax.envs.recording.recording import NAME, load_recording
+
+    check_recorded(episode)
+    return load_recording(episode / NAME)
+
+
+def check_recorded(episode: Path) -> None:
+    """Check that there is a recording in an episode's folder.
+
+    Raises:
+      InputError: there is none.
+    """
+    from mechsearch_jax.envs.recording.recording import NAME
     from mechsearch_jax.runtime.files import is_file
 
     if not is_file(episode / NAME):
         raise InputError(f"{episode / NAME}: there is none; search once more with --record")
-    return load_recording(episode / NAME)
 
 
 def make_film(
@@ -148,4 +179,17 @@ def make_film(
 
     film = Film(recording, width, fps, speed)
     save_movie(track(film, "filming", total=film.count, console=console, transient=True), path, fps)
+    console.print(str(path), soft_wrap=True)
+
+
+def make_page(recording: Recording, path: Path, console: Console) -> None:
+    """Write the page that explains an episode.
+
+    Raises:
+      InputError: it cannot be written.
+    """
+    from mechsearch_jax.envs.page.page import save_page
+
+    with console.status("drawing"):
+        save_page(recording, path)
     console.print(str(path), soft_wrap=True)

@@ -17,7 +17,7 @@ from mechsearch_jax.commands.options import (
     GivenShape,
     find_scenario,
 )
-from mechsearch_jax.commands.recordings import make_film
+from mechsearch_jax.commands.recordings import make_film, make_page
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.episode.records import Episode
     from mechsearch_jax.envs.recording.narration import Narrator
-    from mechsearch_jax.envs.recording.recording import Recorder
+    from mechsearch_jax.envs.recording.recording import Recorder, Recording
     from mechsearch_jax.planner import Problem
     from mechsearch_jax.problem.settings import Settings
     from mechsearch_jax.workspace.scenario import Scenario
@@ -54,13 +54,20 @@ class Kept:
     Attributes:
       record: also write recording.npz, what moved and what was believed, of which `mechsearch video` makes a film.
       video: make the film at once, too; it is recorded then.
+      page: write the page that explains every decision, see `mechsearch view --save`; it is recorded then.
     """
 
     record: bool = False
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4|FILE.webp", help_behavior_hint="")] = None
+    page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html", help_behavior_hint="")] = None
+
+    @property
+    def records(self) -> bool:
+        """Whether the episode is recorded."""
+        return self.record or self.video is not None or self.page is not None
 
     def check(self) -> None:
-        """Fail before the work begins, if a film cannot be written.
+        """Fail before the work begins, if a film or a page cannot be written.
 
         Raises:
           InputError: it cannot.
@@ -71,6 +78,22 @@ class Kept:
         if self.video is not None:
             check_movie_path(self.video)
             check_writable(self.video.parent)
+        if self.page is not None:
+            from mechsearch_jax.envs.page.page import check_page_path
+
+            check_page_path(self.page)
+            check_writable(self.page.parent)
+
+    def make(self, recording: Recording, console: Console) -> None:
+        """Make the film and the page that are wanted of a recording.
+
+        Raises:
+          InputError: one cannot be written.
+        """
+        if self.video is not None:
+            make_film(recording, self.video, console)
+        if self.page is not None:
+            make_page(recording, self.page, console)
 
 
 def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrator: Narrator) -> None:
@@ -88,9 +111,9 @@ def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrat
 
 
 def _run(
-    console: Console, status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int
+    status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int, recorded: Problem | None
 ) -> tuple[Episode, Narrator, Recorder]:
-    """Run the episode; return it with its narrator and its recorder."""
+    """Run the episode; return it with its narrator and its recorder, which keeps evidence if `recorded` is given."""
     from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
     from mechsearch_jax.envs.episode.episodes import run_episode
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
@@ -98,7 +121,7 @@ def _run(
 
     policy, workcell = chosen.policy(), chosen.workcell
     first = first_decision(problem, policy, SimulatorConfig().motion)
-    with prepared(first, lambda text: console.print(text, style="dim")):
+    with prepared(first, lambda text: status.console.print(text, style="dim")):
         # These take long to import; meanwhile the first decision's program is read or compiled.
         from mechsearch_jax.envs.recording.narration import Narrator
         from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
@@ -107,8 +130,8 @@ def _run(
         simulator = NativeSimulator(
             config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
         )
-        recorder = Recorder(simulator)
-        narrator = Narrator(console, status, problem, recorder.note)
+        recorder = Recorder(simulator, recorded)
+        narrator = Narrator(status.console, status, problem, recorder.note)
         settings = RunSettings(
             recogniser=chosen.recogniser(problem.target),
             max_steps=chosen.config.max_steps,
@@ -166,20 +189,20 @@ def search(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
         problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
-        episode, narrator, recorder = _run(console, status, chosen, scene, problem, seed)
+        recorded = problem if keeps.records else None
+        episode, narrator, recorder = _run(status, chosen, scene, problem, seed, recorded)
         # Imported late: they take long.
         from mechsearch_jax.envs.recording.narration import verdict
         from mechsearch_jax.envs.recording.recording import NAME, save_recording
 
         status.update("writing")
         _save(out, scene, episode, problem, narrator)
-        recording = recorder.recording(problem, verdict(episode))
-        if keeps.record or keeps.video is not None:
+        recording = recorder.recording(problem, verdict(episode), episode)
+        if keeps.records:
             save_recording(recording, out / NAME)
     narrator.ended(episode)
     console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True)
-    if keeps.video is not None:
-        make_film(recording, keeps.video, console)
+    keeps.make(recording, console)
 
 
 def _scene(

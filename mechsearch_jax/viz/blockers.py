@@ -81,22 +81,36 @@ def blockers_figure(
 
 
 def _draw(view: Axes, above: Axes, moment: Moment, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
-    drawing.draw_view(view, moment.image, camera, shelf, room)
-    drawing.draw_numbers_in_view(view, moment.owner, moment.scene.capacity)
+    draw_seen_blockers(view, moment, camera, shelf, room)
     drawing.draw_shelf(above, shelf)
     drawing.draw_objects(above, moment.scene)
     drawing.draw_target(above, moment.target_pose, target, certain=True)
-    seen, from_above = drawing.outlines_in_view(moment.scene, camera), drawing.outlines(moment.scene)
-    for index in moment.blockers:
-        for axes, outline in ((view, seen[index]), (above, _turned(from_above[index]))):
-            if outline is not None:
-                axes.add_patch(
-                    patches.Polygon(
-                        outline, closed=True, facecolor=(*drawing.rgb(MARK), 0.3), edgecolor=MARK, lw=2.2, zorder=4
-                    )
-                )
+    mark_from_above(above, moment.scene, moment.blockers)
 
 
-def _turned(outline: np.ndarray | None) -> np.ndarray | None:
-    """An outline in x and y in the axes of the picture from above: y across, x upwards."""
-    return None if outline is None else outline[:, ::-1]
+def draw_seen_blockers(axes: Axes, moment: Moment, camera: Camera, shelf: Shelf, room: float) -> None:
+    """Draw the camera's view at a moment, with the objects in the way marked.
+
+    Args:
+      axes: empty.
+      moment: what is drawn.
+      camera, shelf: of the problem.
+      room: height of the shown part above the board [m].
+    """
+    drawing.draw_view(axes, moment.image, camera, shelf, room)
+    drawing.draw_numbers_in_view(axes, moment.owner, moment.scene.capacity)
+    seen = drawing.outlines_in_view(moment.scene, camera)
+    _mark(axes, [seen[index] for index in moment.blockers])
+
+
+def mark_from_above(axes: Axes, scene: Superquadrics, blockers: Collection[int]) -> None:
+    """Mark the objects in the way in a picture from above."""
+    outlines = [drawing.outlines(scene)[index] for index in blockers]
+    _mark(axes, [None if outline is None else outline[:, ::-1] for outline in outlines])
+
+
+def _mark(axes: Axes, outlines: Sequence[Float[np.ndarray, "corners 2"] | None]) -> None:
+    for outline in outlines:
+        if outline is not None:
+            style = {"facecolor": (*drawing.rgb(MARK), 0.3), "edgecolor": MARK, "lw": 2.2, "zorder": 4}
+            axes.add_patch(patches.Polygon(outline, closed=True, **style))

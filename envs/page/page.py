@@ -1,0 +1,212 @@
+"""The page that explains a recorded episode: one HTML file that holds everything and loads nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jinja2
+import numpy as np
+
+from mechsearch_jax.actions import kind_of
+from mechsearch_jax.envs.camera.snapshot import true_target_pose
+from mechsearch_jax.envs.episode.episode_log import target_trouble
+from mechsearch_jax.envs.episode.records import Step, load_episode
+from mechsearch_jax.envs.known_target.in_the_way import blocking
+from mechsearch_jax.envs.page import steps as texts
+from mechsearch_jax.envs.page.ending import action_words, ending, executed_words, plain
+from mechsearch_jax.envs.page.pictures import Painter, last_world, objects_of
+from mechsearch_jax.envs.recording.narration import events, verdict
+from mechsearch_jax.envs.recording.pictures import recorded_frame
+from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
+from mechsearch_jax.envs.world.world import TARGET
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, is_file, replacing
+from mechsearch_jax.viz import drawing
+
+_TEMPLATE = Path(__file__).with_name("page.html.jinja")
+RECORD = "episode.json"
+# Options of an episode that its card names.
+_FACTS = ("policy", "recognition", "rehearsal", "seed")
+
+
+def check_page_path(path: Path) -> None:
+    """Check before the work begins that a page's file is named as one.
+
+    Raises:
+      InputError: it is not.
+    """
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: ends in neither .html nor .htm; name a page that does")
+
+
+def recording_with_record(folder: Path) -> Recording:
+    """The recording in a folder; of an earlier version, with the record of the episode that lies beside it.
+
+    Raises:
+      InputError: one of them cannot be read, or they are of different episodes.
+    """
+    recording = load_recording(folder / NAME)
+    if recording.episode is not None or not is_file(folder / RECORD):
+        return recording
+    episode = load_episode(folder / RECORD)
+    if len(episode.steps) != len(recording.steps) or verdict(episode) != recording.heading:
+        raise InputError(f"{folder / RECORD}: is of another episode than {NAME} beside it; search once more")
+    return dataclasses.replace(recording, episode=episode)
+
+
+def save_page(recording: Recording, path: PathLike) -> None:
+    """Write the page of an episode.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    text = page(recording)
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def page(recording: Recording) -> str:
+    """The page of an episode as HTML."""
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+    painter = Painter(recording)
+    shown = [_step(recording, i, painter) for i in range(len(recording.steps))]
+    return template.render(
+        title=recording.heading.partition(":")[0] or "an episode",
+        stamp=stamp(),
+        card=_card(recording, painter),
+        steps=shown,
+        bands=[(band.colour, band.label) for band in drawing.bands()],
+        colours={name: getattr(drawing, name) for name in ("TARGET", "ACTION", "OBJECT")},
+        left_out=_left_out(recording),
+    )
+
+
+def stamp() -> str:
+    """A hash of the program that writes pages, which every page carries: another one, and the page is of other code."""
+    sources = [_TEMPLATE, *sorted(_TEMPLATE.parent.glob("*.py"))]
+    return hashlib.sha256("\0".join(source.read_text(encoding="utf-8") for source in sources).encode()).hexdigest()[:16]
+
+
+def _card(recording: Recording, painter: Painter) -> dict[str, Any]:
+    end, last = ending(recording), recording.steps[-1]
+    world = last_world(last)
+    scene = objects_of(world, recording.camera, recording.shelf)
+    upright = (
+        target_trouble(recording.shelf, *(np.asarray(a)[TARGET] for a in (world.position, world.rotation))) is None
+    )
+    stands = upright and not (recording.episode is not None and recording.episode.retrieved)
+    pose = np.asarray(true_target_pose(jax.tree.map(jnp.asarray, world))) if stands else None
+    blockers = [i for i in end.blockers if scene.valid[i]]
+    seen, above = painter.end(world, scene, pose, blockers)
+    return {
+        **end._asdict(),
+        "stands": stands,
+        "facts": _facts(recording),
+        "seen": seen,
+        "above": above,
+        "blockers": blockers,
+    }
+
+
+def _facts(recording: Recording) -> list[tuple[str, str]]:
+    episode = recording.episode
+    if episode is None:
+        return []
+    facts = [(name, str(episode.config[name])) for name in _FACTS if name in episode.config]
+    differs = [f"{name.partition('.')[2]} {value}" for name, value in episode.config.items() if "mismatch." in name]
+    facts += [("world differs", ", ".join(differs))] if differs else []
+    kinds = [step.action.kind for step in episode.steps if step.action is not None]
+    takes = kinds.count("retrieve")
+    moves = f"{len(kinds) - takes} of at most {episode.config.get('max_steps', 'any number')}"
+    also = f" and {takes} to take the target out" if takes else ""
+    facts += [("objects", str(episode.objects)), ("actions", moves + also)]
+    gains = [
+        (step.cost - step.predicted_cost, step.cost - step.observed_cost)
+        for step in episode.steps
+        if step.cost is not None and step.predicted_cost is not None and step.observed_cost is not None
+    ]
+    if gains:
+        promised, came = (round(sum(column)) for column in zip(*gains, strict=True))
+        # A policy may mind no cost.
+        facts += [("J was to fall by", f"{promised} in all, and fell by {came}")] if promised or came else []
+    return facts
+
+
+def _left_out(recording: Recording) -> list[str]:
+    """What the recording does not hold, so that the page leaves it out."""
+    sentences = []
+    if recording.episode is None:
+        sentences.append("The record of the episode is missing, so costs and the reason of the end are left out.")
+    if all(step.evidence is None for step in recording.steps):
+        sentences.append(
+            "The recording is of an earlier version: predicted f and g, trials, confidence and the objects that block "
+            "grasps are left out. Search once more with --record to have them."
+        )
+    return sentences
+
+
+def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
+    step, before = recording.steps[i], recording.steps[i - 1] if i else None
+    record = None if recording.episode is None else recording.episode.steps[i]
+    frame = recorded_frame(step, recording.camera, recording.shelf)
+    candidates = texts.candidates(step)
+    shapes = texts.shapes(recording, step, frame.owner)
+    blocked = _blocked(step)
+    sure = np.full(step.scene.capacity, np.nan) if step.evidence is None else step.evidence.confidence
+    return {
+        "number": i + 1,
+        "heading": texts.heading(step),
+        "kind": "end" if step.action is None else kind_of(int(step.action.kind)).name,
+        "words": action_words(step),
+        "executed": "" if executed_words(recording, i) == action_words(step) else executed_words(recording, i),
+        "found": step.found,
+        "blocked": bool(blocked),
+        "belief": texts.poses_in_words(step, before),
+        "truth": _truth(step, record),
+        "grasps": texts.grasps_words(step),
+        "seen": painter.seen(frame),
+        "map": painter.believed(step, frame, before, blocked),
+        "candidates": [{**c._asdict(), "picture": painter.foreseen(step, c.row)} for c in candidates],
+        "sampled": len(step.sampled),
+        "retrieves": step.action is not None and kind_of(int(step.action.kind)).takes_target,
+        "trials": texts.trials(step),
+        "shapes": shapes,
+        "recognised": painter.recognised(step, frame, sure) if shapes else None,
+        "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,
+        "costs": texts.costs(recording, i),
+        "troubles": [] if record is None else [*([plain(record.failure)] if record.failure else []), *events(record)],
+        **_counts(step),
+    }
+
+
+def _counts(step: RecordedStep) -> Mapping[str, int]:
+    """Numbers of poses for the time line."""
+    size = 1 if step.found else int(step.existence.sum())
+    return {"size": size, "good": texts.graspable(step.existence, step.graspability)}
+
+
+def _blocked(step: RecordedStep) -> tuple[int, ...]:
+    """The recognised objects that block a found target."""
+    if step.evidence is None or not step.found or not len(step.evidence.hits):
+        return ()
+    return tuple(i for i in blocking(step.evidence.hits) if step.scene.valid[i])
+
+
+def _truth(step: RecordedStep, record: Step | None) -> str:
+    """Whether the belief holds the truth."""
+    if texts.believed_elsewhere(step):
+        return "It is not the target."
+    if record is None or record.truth_possible is None:
+        return ""
+    if record.truth_possible:
+        return "The true pose is among the possible ones."
+    return "The true pose is not among the possible ones: the belief is wrong."

@@ -1,0 +1,213 @@
+"""The pictures of an episode's page, as data URIs: what the camera saw, and the shelf from above."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Collection
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from matplotlib import patches
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
+from mechsearch_jax.envs.recording.pictures import colour_image
+from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
+from mechsearch_jax.envs.recording.sampled import Sampled
+from mechsearch_jax.envs.recording.shown_decisions import sampled_sketch
+from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.viz import drawing, sketches
+from mechsearch_jax.viz.blockers import Moment, draw_seen_blockers, mark_from_above
+from mechsearch_jax.viz.filmstrip import Frame, draw_seen
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+# Width of a picture [inches], dots per inch, and the quality of WebP.
+WIDTH, DPI, QUALITY = 3.6, 190, 80
+# Confidence from which a shape is sure, and below which it is doubtful.
+SURE, DOUBTFUL = 0.8, 0.5
+# Colours of candidate poses that were ruled out or opened again since the step before.
+RULED_OUT, REOPENED = "#9aa5ae", drawing.ACTION
+
+
+class Painter:
+    """Draws the pictures of one recording at one scale."""
+
+    def __init__(self, recording: Recording):
+        """Args:
+        recording: of the episode.
+        """
+        self._camera: Camera = recording.camera
+        self._shelf: Shelf = recording.shelf
+        self._target: Target = recording.target
+        scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
+        self._room = drawing.height_of(scenes, recording.shelf)
+
+    def seen(self, frame: Frame) -> str:
+        """What the camera saw at a step, with the action."""
+        camera, shelf = self._camera, self._shelf
+        return self._view(lambda axes: draw_seen(axes, frame, camera, shelf, self._target, self._room))
+
+    def recognised(self, step: RecordedStep, frame: Frame, confidence: Float[np.ndarray, " n"]) -> str:
+        """The outlines of the recognised shapes over what the camera saw, coloured by how sure recognition is."""
+
+        def draw(axes: Axes) -> None:
+            drawing.draw_view(axes, frame.image, self._camera, self._shelf, self._room)
+            for i, outline in enumerate(drawing.outlines_in_view(step.scene, self._camera)):
+                if outline is None:
+                    continue
+                sure = float(confidence[i])
+                colour = drawing.TARGET if sure < DOUBTFUL else drawing.BLOCKED[1] if sure < SURE else drawing.ACTION
+                axes.add_patch(patches.Polygon(outline, closed=True, facecolor="none", edgecolor=colour, linewidth=1.6))
+                x, y = outline.mean(axis=0)
+                text = drawing.number(axes, (float(x), float(y)), i)
+                # More would cover what it is about.
+                if sure < SURE:
+                    text.set_text(f"{i}: {100 * sure:.0f} %")
+
+        return self._view(draw)
+
+    def believed(self, step: RecordedStep, frame: Frame, before: RecordedStep | None, blockers: Collection[int]) -> str:
+        """f and g from above, what changed since the step before, the objects, the target's true pose, the action."""
+
+        def draw(axes: Axes) -> None:
+            self._map(axes, step, step.existence, step.graspability, step.scene)
+            if before is not None and not (step.found or before.found):
+                self._changes(axes, before.existence, step.existence)
+            mark_from_above(axes, step.scene, blockers)
+            flat = sketches.from_above
+            sketches.draw_action(axes, flat, frame.sketch, step.scene, step.after, self._shelf)
+            sketches.draw_taken_target(axes, flat, frame.sketch, step.target_pose, self._target, self._shelf)
+
+        return self._above(draw)
+
+    def foreseen(self, step: RecordedStep, k: int) -> str:
+        """f and g from above as predicted after a candidate, the objects there, and the action."""
+        candidates: Sampled = step.sampled
+        after = candidates.after(k, step.scene)
+
+        def draw(axes: Axes) -> None:
+            forecasts = None if step.evidence is None else step.evidence.forecasts
+            if forecasts is not None and k < len(forecasts):
+                self._map(axes, step, forecasts.existence[k], forecasts.graspability[k], after)
+            else:
+                self._map(axes, step, np.zeros_like(step.existence), step.graspability, after)
+            sketch = sampled_sketch(step, k)
+            sketches.draw_action(axes, sketches.from_above, sketch, step.scene, after, self._shelf)
+
+        return self._above(draw)
+
+    def end(
+        self, world: World, scene: Superquadrics, pose: np.ndarray | None, blockers: Collection[int]
+    ) -> tuple[str, str]:
+        """The true state in the camera's view and from above, with the objects in the way marked.
+
+        Args:
+          world: the state.
+          scene: its objects.
+          pose: x, y [m] and yaw [rad] of the target; None if it does not stand on the board.
+          blockers: indices of the objects in the way.
+        """
+        image = Snapshot(self._camera, self._shelf, jax.tree.map(jnp.asarray, world)).image
+        owner, somewhere = np.asarray(image.segmentation), np.zeros(3) if pose is None else pose
+        moment = Moment("", colour_image(image), owner, scene, somewhere, blockers)
+
+        def seen(axes: Axes) -> None:
+            draw_seen_blockers(axes, moment, self._camera, self._shelf, self._room)
+            if pose is not None:
+                drawing.draw_hidden_target_in_view(axes, pose, self._target, self._camera, self._shelf)
+
+        def above(axes: Axes) -> None:
+            drawing.draw_shelf(axes, self._shelf)
+            drawing.draw_objects(axes, scene)
+            if pose is not None:
+                drawing.draw_target(axes, pose, self._target, certain=True)
+            mark_from_above(axes, scene, blockers)
+
+        return self._view(seen), self._above(above)
+
+    def _map(
+        self,
+        axes: Axes,
+        step: RecordedStep,
+        existence: Bool[np.ndarray, " x"],
+        graspability: np.ndarray,
+        scene: Superquadrics,
+    ) -> None:
+        drawing.draw_shelf(axes, self._shelf)
+        drawing.draw_map(axes, drawing.map_image(existence, graspability, self._target), self._shelf, self._target)
+        drawing.draw_objects(axes, scene)
+        drawing.draw_target(axes, step.target_pose, self._target, step.found)
+
+    def _changes(self, axes: Axes, before: Bool[np.ndarray, " x"], now: Bool[np.ndarray, " x"]) -> None:
+        """Mark the cells in which the target could be before and no more, or the other way round."""
+        rows, columns = self._target.grid
+        was, stays = (a.reshape(rows, columns, -1).any(axis=-1).ravel() for a in (before, now))
+        places = self._target.candidate_poses(self._shelf).reshape(rows * columns, -1, 3)[:, 0, :2]
+        for cells, colour, mark in ((was & ~stays, RULED_OUT, "x"), (stays & ~was, REOPENED, "+")):
+            x, y = places[cells].T
+            axes.scatter(y, x, s=11, c=colour, marker=mark, linewidths=1.0, zorder=2)
+
+    def _view(self, draw: Callable[[Axes], None]) -> str:
+        left, right, top, bottom = drawing.view_window(self._camera, self._shelf, self._room)
+        return data_uri(_drawn((bottom - top) / (right - left), draw))
+
+    def _above(self, draw: Callable[[Axes], None]) -> str:
+        return data_uri(_drawn(drawing.map_share(self._shelf), draw))
+
+
+def hidden_behind(step: RecordedStep, camera: Camera, shelf: Shelf) -> list[tuple[int, float]]:
+    """The objects that hide the target from the camera, the greatest share of its pixels first, with that share."""
+    world = jax.tree.map(jnp.asarray, step.world)
+    alone = world.replace(valid=jnp.arange(len(world.valid)) == TARGET)
+    there = np.asarray(Snapshot(camera, shelf, alone).image.segmentation) == TARGET
+    owner = np.asarray(Snapshot(camera, shelf, world).image.segmentation)[there]
+    counts = np.bincount(owner[(owner >= 0) & (owner < TARGET)], minlength=TARGET)
+    return [(int(i), float(counts[i]) / len(owner)) for i in np.argsort(-counts, kind="stable") if counts[i]]
+
+
+def target_pixels(step: RecordedStep, camera: Camera, shelf: Shelf) -> int:
+    """The number of pixels that the target shows at a step."""
+    world = jax.tree.map(jnp.asarray, step.world)
+    return int(np.count_nonzero(np.asarray(Snapshot(camera, shelf, world).image.segmentation) == TARGET))
+
+
+def last_world(step: RecordedStep) -> World:
+    """The true state after the step's action, or at the step if there was none."""
+    if not len(step.trace.time):
+        return step.world
+    rotation = Rotation.from_quat(np.asarray(step.trace.quaternion[-1]), scalar_first=True).as_matrix()
+    return step.world.replace(
+        position=np.asarray(step.trace.position[-1], np.float32), rotation=rotation.astype(np.float32)
+    )
+
+
+def objects_of(world: World, camera: Camera, shelf: Shelf) -> Superquadrics:
+    """The true objects of a state that are on the board; NumPy arrays."""
+    snapshot = Snapshot(camera, shelf, jax.tree.map(jnp.asarray, world))
+    return jax.tree.map(np.asarray, objects_on_the_board(snapshot))
+
+
+def data_uri(picture: UInt8[np.ndarray, "h w 3"]) -> str:
+    """A picture as WebP in a data URI."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format="WEBP", quality=QUALITY, method=5)
+    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _drawn(share: float, draw: Callable[[Axes], None]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture whose height is a share of its width."""
+    figure = Figure(figsize=(WIDTH, WIDTH * share), dpi=DPI, facecolor=drawing.PAPER)
+    canvas = FigureCanvasAgg(figure)
+    draw(figure.add_axes((0.0, 0.0, 1.0, 1.0)))
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])

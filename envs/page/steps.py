@@ -1,0 +1,236 @@
+"""What the page of an episode says of each step: belief, decision, trials, recognition, and what came of it."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from mechsearch_jax.actions import kind_of
+from mechsearch_jax.envs.camera.snapshot import Snapshot
+from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words
+from mechsearch_jax.envs.page.ending import action_words, believed_elsewhere, counted, free, same_action
+from mechsearch_jax.envs.page.pictures import objects_of
+from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
+from mechsearch_jax.graspability import INFEASIBLE
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import recognition_doubt
+from mechsearch_jax.planner.trials import TrialResult
+
+RESULTS = {
+    TrialResult.SUCCEEDED: ("good", "went as intended"),
+    TrialResult.FAILED: ("poor", "not carried out as intended: held up, out of reach, or out of the hand"),
+    TrialResult.HARMFUL: ("bad", "harm: something fell off the board, or the found target fell over"),
+    TrialResult.UNKNOWN: ("poor", "no result: it could not be simulated"),
+}
+# Recognisers that see images, and may be wrong.
+SEEING = ("masks", "full")
+# An object that shows no more pixels than this counts as hidden.
+FEWEST_PIXELS = 100
+# A body that is recognised farther than this from where it is counts as wrong [m].
+WRONG = 0.02
+
+
+class Candidate(NamedTuple):
+    """One of the two best candidates of a decision.
+
+    Attributes:
+      role: "chosen" or "runner-up".
+      words: the action.
+      value, cost: equation 2 of its sequence, and predicted J after it.
+      belief: predicted f and g in words; empty if not recorded.
+      row: its index among the sampled actions.
+    """
+
+    role: str
+    words: str
+    value: str
+    cost: str
+    belief: str
+    row: int
+
+
+class Trial(NamedTuple):
+    """Actions alike that were tried out: in words, what came of them, how that is coloured, and what followed."""
+
+    words: str
+    result: str
+    colour: str
+    verdict: str
+
+
+class Shape(NamedTuple):
+    """A recognised object: its number, what it is taken for, how sure that is, how far it is from the true body."""
+
+    number: str
+    words: str
+    confidence: str
+    off: str
+    wrong: bool
+
+
+def poses_in_words(step: RecordedStep, before: RecordedStep | None) -> str:
+    """f and g of a step, and how f changed since the step before."""
+    if step.found:
+        return "The target is found, so f is this one pose."
+    if believed_elsewhere(step):
+        return "Something else is taken for the target, so f is that one pose."
+    size, poses = int(step.existence.sum()), len(step.existence)
+    good = graspable(step.existence, step.graspability)
+    words = f"f: the target can be at {size} of {poses} poses; g: at {good} of these a grasp would meet nothing."
+    if before is None or before.found:
+        return words
+    gone = int((before.existence & ~step.existence).sum())
+    new = int((step.existence & ~before.existence).sum())
+    change = [f"{counted(gone, 'pose')} {_were(gone)} ruled out"] if gone else []
+    change += [f"{counted(new, 'pose')} {_were(new)} opened again"] if new else []
+    return f"{words} Since the step before, {' and '.join(change) or 'nothing changed'}."
+
+
+def graspable(existence: np.ndarray, graspability: np.ndarray) -> int:
+    """Number of possible poses at which a grasp meets nothing."""
+    return int((existence & (graspability == 1)).sum())
+
+
+def grasps_words(step: RecordedStep) -> str:
+    """What the grasps of a target that is found would meet; empty if that is not recorded."""
+    if step.evidence is None or not step.found:
+        return ""
+    hits = step.evidence.hits
+    if free(hits):
+        clear = int((~hits.any(axis=1)).sum())
+        return f"{clear} of {len(hits)} grasps that arm and shelf allow hit{'s' if clear == 1 else ''} nothing."
+    return f"{grasps_in_words(hits)}.".capitalize()
+
+
+def candidates(step: RecordedStep) -> list[Candidate]:
+    """The chosen action and the runner-up; none where nothing was chosen, or no sequences were compared."""
+    if step.action is None or not kind_of(int(step.action.kind)).moves_object:
+        return []
+    chosen = [k for k in range(len(step.sampled)) if same_action(step, step.sampled.action, k)][:1]
+    others = [k for k in range(len(step.sampled)) if k not in chosen][:1]
+    return [_candidate(step, role, k) for role, rows in (("chosen", chosen), ("runner-up", others)) for k in rows]
+
+
+def _candidate(step: RecordedStep, role: str, k: int) -> Candidate:
+    action = step.sampled.single(k)
+    words = kind_of(int(action.kind)).describe(action, step.scene.capacity)
+    value, cost = (float(numbers[k]) for numbers in (step.sampled.value, step.sampled.cost))
+    return Candidate(role, words, f"{value + 0.0:+.1f}".replace("-0.0", "0.0"), number(cost), _forecast(step, k), k)
+
+
+def number(cost: float) -> str:
+    """A cost with as many digits as matter."""
+    return f"{cost:.0f}" if abs(cost) >= 20 else f"{cost:.1f}"
+
+
+def _forecast(step: RecordedStep, k: int) -> str:
+    forecasts = None if step.evidence is None else step.evidence.forecasts
+    if forecasts is None or k >= len(forecasts):
+        return ""
+    least = int(forecasts.in_the_way[k])
+    if least == INFEASIBLE:
+        return "no grasp would be possible"
+    if least >= 0:
+        return "a grasp would be free" if least == 0 else f"the best grasp would hit {counted(least, 'object')}"
+    exists, g = forecasts.existence[k], forecasts.graspability[k]
+    return f"f at {counted(int(exists.sum()), 'pose')}, graspable at {graspable(exists, g)}"
+
+
+def _were(count: int) -> str:
+    return "was" if count == 1 else "were"
+
+
+def trials(step: RecordedStep) -> list[Trial]:
+    """What was tried out at a step, in order."""
+    if step.evidence is None:
+        return []
+    tried = step.evidence.tried
+    rows = []
+    for k, code in enumerate(tried.result.tolist()):
+        result = TrialResult(code)
+        kind = kind_of(int(tried.action.kind[k]))
+        single = type(tried.action)(*(getattr(tried.action, name)[k] for name in tried.action.__dataclass_fields__))
+        made = same_action(step, tried.action, k)
+        passed = "passed over" if result is TrialResult.FAILED else "refused"
+        verdict = "chosen" if made else "not better" if result is TrialResult.SUCCEEDED else passed
+        colour, words = RESULTS[result]
+        if kind.takes_target and result is not TrialResult.SUCCEEDED:
+            colour, words, verdict = "poor", "the target was not taken out", "passed over"
+        rows.append(Trial(kind.describe(single, step.scene.capacity), words, colour, verdict))
+    # Grasps of the target are alike in words.
+    alike = [(row, len(list(group))) for row, group in itertools.groupby(rows)]
+    return [row._replace(words=f"{row.words}, {count} ways") if count > 1 else row for row, count in alike]
+
+
+def shapes(recording: Recording, step: RecordedStep, owner: Int[np.ndarray, "h w"]) -> list[Shape]:
+    """The recognised objects beside the true ones; empty where the true shapes were given.
+
+    Args:
+      recording: of the episode.
+      step: one of its steps.
+      owner: the true object at each pixel of the image.
+    """
+    episode = recording.episode
+    if episode is None or episode.config.get("recognition") not in SEEING:
+        return []
+    truth = objects_of(step.world, recording.camera, recording.shelf)
+    sure = np.full(step.scene.capacity, np.nan) if step.evidence is None else step.evidence.confidence
+    rows = []
+    for i in range(step.scene.capacity):
+        seen, there = bool(step.scene.valid[i]), bool(truth.valid[i])
+        if not (seen or there):
+            continue
+        confidence = f"{100 * float(sure[i]):.0f} %" if seen and np.isfinite(sure[i]) else "–"
+        if not seen:
+            visible = bool(np.count_nonzero(owner == i) > FEWEST_PIXELS)
+            rows.append(Shape(str(i), "not recognised" if visible else "hidden", confidence, "–", visible))
+            continue
+        off = float(np.linalg.norm(np.asarray(step.scene.position[i]) - np.asarray(truth.position[i])))
+        apart = f"{100 * off:.1f} cm" if there else "nothing is there"
+        rows.append(Shape(str(i), _shape(step, i), confidence, apart, not there or off > WRONG))
+    return rows
+
+
+def _shape(step: RecordedStep, i: int) -> str:
+    """A recognised shape in words, with its size."""
+    x, y, z = (200 * float(half) for half in step.scene.size[i])
+    if float(step.scene.exponents[i, 1]) > 0.5:
+        return f"cylinder, {x:.0f} cm wide, {z:.0f} cm long"
+    return f"box, {x:.0f} × {y:.0f} × {z:.0f} cm"
+
+
+def doubt(recording: Recording, step: RecordedStep, depth: np.ndarray) -> str:
+    """How badly the recognised shapes explain an image without noise."""
+    seen = Observation(step.scene, jnp.array(step.found), jnp.asarray(step.target_pose))
+    measure = recognition_doubt(recording, seen, depth)
+    passed = f"; {100 * measure.passed:.0f} % of the rays to {measure.worst} pass through it" if measure.worst else ""
+    return f"{100 * measure.unexplained:.0f} % of what stands on the board lies on no recognised shape{passed}."
+
+
+def depth_of(recording: Recording, step: RecordedStep) -> np.ndarray:
+    """The depth image of a step without noise [m]."""
+    return np.asarray(Snapshot(recording.camera, recording.shelf, step.world).image.depth)
+
+
+def costs(recording: Recording, i: int) -> tuple[str, bool] | None:
+    """J before a step's action, as expected after it and as observed, and whether it came out as much worse.
+
+    None where that is not recorded.
+    """
+    if recording.episode is None or recording.steps[i].action is None:
+        return None
+    record = recording.episode.steps[i]
+    if record.cost is None or record.predicted_cost is None:
+        return None
+    observed = "not observed" if record.observed_cost is None else f"{number(record.observed_cost)} observed"
+    worse = record.observed_cost is not None and record.observed_cost > record.predicted_cost + 0.1 * record.cost
+    return f"J: {number(record.cost)} before, {number(record.predicted_cost)} expected, {observed}", worse
+
+
+def heading(step: RecordedStep) -> str:
+    """What was done at a step."""
+    return "the search ends here" if step.action is None else action_words(step)

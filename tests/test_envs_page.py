@@ -1,0 +1,420 @@
+"""The page that explains an episode: what a recording keeps for it, what it says, and that it holds everything."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recordings import FAR, OBJECTS, PUSH, RECORDING, RETRIEVAL, SEQUENCES, step
+from stage import HIDDEN
+
+from mechsearch_jax.actions import no_action
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.episode.moments import TriedActions, nothing_tried
+from mechsearch_jax.envs.episode.noted_trials import NotedTrials
+from mechsearch_jax.envs.episode.protocols import REACHED
+from mechsearch_jax.envs.episode.records import Episode, Step, record_action, save_episode
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets
+from mechsearch_jax.envs.page import page as pages
+from mechsearch_jax.envs.page.ending import ending, executed_words, plain
+from mechsearch_jax.envs.page.page import RECORD, page, recording_with_record
+from mechsearch_jax.envs.page.pictures import hidden_behind, last_world
+from mechsearch_jax.envs.page.steps import shapes
+from mechsearch_jax.envs.recording.evidence import Evidence, Forecasts
+from mechsearch_jax.envs.recording.narration import verdict
+from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Decision, initial_belief
+from mechsearch_jax.planner.trials import TrialResult, decide, sequences_to_try
+from mechsearch_jax.runtime.errors import InputError
+
+POSES = len(RECORDING.steps[0].existence)
+SLOTS = OBJECTS.capacity
+
+
+def stacked(*actions):
+    return jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a]), *actions)
+
+
+def evidence(found=False, hits=((0,), (0, 2)), tried=None):
+    """Evidence of a step with two candidates, where each grasp hits what is listed for it."""
+    everywhere, level = np.ones((2, POSES), bool), np.ones((2, POSES), np.int32)
+    table = np.array([[i in row for i in range(SLOTS)] for row in hits])
+    return Evidence(
+        confidence=np.where(np.asarray(OBJECTS.valid), np.float32(0.9), np.float32(0.0)),
+        believed_pose=np.array([0.62, 0.07, 0.0], np.float32) if found else np.full(3, np.nan, np.float32),
+        hits=table,
+        forecasts=Forecasts(everywhere, level, np.array([1, 2] if found else [-1, -1], np.int32)),
+        tried=tried or nothing_tried(),
+    )
+
+
+TRIED = TriedActions(stacked(FAR, PUSH), np.array([TrialResult.HARMFUL, TrialResult.SUCCEEDED], np.int32))
+STEPS = (
+    dataclasses.replace(RECORDING.steps[0], evidence=evidence(tried=TRIED)),
+    dataclasses.replace(RECORDING.steps[1], evidence=evidence(found=True), found=True),
+)
+
+
+def record(action, **changes):
+    fields = {
+        "belief_size": 99, "found": False, "graspable": False, "cost": 100.0, "predicted_cost": 60.0,
+        "observed_cost": 95.0, "sequences": 2, "failure": None, "timings": {}, "truth_possible": True,
+        "action": None if action is None else record_action(action),
+    }  # fmt: skip
+    return Step(**{**fields, **changes})
+
+
+EPISODE = Episode(
+    scenario="hidden",
+    objects=1,
+    config={"policy": "search-for-grasp", "recognition": "masks", "max_steps": 1, "seed": 3},
+    versions={},
+    steps=(record(PUSH), record(None, found=True, cost=None, predicted_cost=None, observed_cost=None)),
+    found_step=1,
+    graspable_step=None,
+    retrieved=False,
+    failure="found, but not graspable",
+)
+LOST = dataclasses.replace(RECORDING, heading="hidden: found after 1 action", steps=STEPS, episode=EPISODE)
+
+
+@pytest.fixture(scope="module")
+def text():
+    return page(LOST)
+
+
+def words(text):
+    """What a reader sees, without the pictures."""
+    return " ".join(re.sub(r"<(style|script).*?</\1>|<[^>]*>", " ", text, flags=re.S).split())
+
+
+def test_evidence_comes_back_as_it_was_written(tmp_path):
+    save_recording(LOST, tmp_path / NAME)
+    again = load_recording(tmp_path / NAME)
+    assert again.episode == EPISODE
+    for read, written in zip(again.steps, LOST.steps, strict=True):
+        for name in ("confidence", "believed_pose", "hits"):
+            np.testing.assert_array_equal(getattr(read.evidence, name), getattr(written.evidence, name))
+        jax.tree.map(np.testing.assert_array_equal, read.evidence.tried, written.evidence.tried)
+        for field in dataclasses.fields(Forecasts):
+            ours, theirs = (getattr(each.evidence.forecasts, field.name) for each in (read, written))
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_recording_of_an_earlier_version_opens(tmp_path):
+    save_recording(RECORDING, tmp_path / NAME)
+    with np.load(tmp_path / NAME) as file:
+        assert not [name for name in file if name.startswith("evidence")]
+        assert '"episode"' not in str(file["head"])
+    again = load_recording(tmp_path / NAME)
+    assert again.episode is None
+    assert [step.evidence for step in again.steps] == [None] * 3
+
+
+def halve_hits(arrays):
+    arrays["evidence.hits"] = arrays["evidence.hits"][1:]
+
+
+def forget_results(arrays):
+    del arrays["evidence.result"]
+
+
+def invent_results(arrays):
+    arrays["evidence.result"] = arrays["evidence.result"] + 40
+
+
+def negate_rows(arrays):
+    arrays["evidence.foreseen.existence.rows"] = -arrays["evidence.foreseen.existence.rows"]
+
+
+def retype_confidence(arrays):
+    arrays["evidence.confidence"] = arrays["evidence.confidence"].astype("U3")
+
+
+@pytest.mark.parametrize("spoil", [halve_hits, forget_results, invent_results, negate_rows, retype_confidence])
+def test_spoilt_evidence_is_refused_in_one_line(spoil, tmp_path):
+    save_recording(LOST, tmp_path / NAME)
+    with np.load(tmp_path / NAME) as file:
+        arrays = dict(file)
+    spoil(arrays)
+    np.savez(tmp_path / NAME, **arrays)
+    with pytest.raises(InputError, match=f"{NAME}: is no recording of an episode") as refused:
+        load_recording(tmp_path / NAME)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_card_says_why_the_target_was_lost(text):
+    sentences = words(text)
+    assert "Lost: found, but not graspable" in sentences
+    assert "The target was seen after 1 action. The only action that an episode may have was used up" in sentences
+    # The second grasp hits more than the first.
+    assert "each of the 2 grasps that arm and shelf allow hits object 0." in sentences
+    assert "Orange: in the way" in sentences
+    assert "J was to fall by 40 in all, and fell by 5" in sentences
+    assert "actions 1 of at most 1" in sentences
+
+
+def test_a_step_shows_the_decision_beside_the_runner_up(text):
+    sentences = words(text)
+    assert "chosen: push object 0 by 10 cm" in sentences
+    assert "runner-up: push object 0 by 20 cm" in sentences
+    assert f"Predicted: f at {POSES} poses, graspable at {POSES}, J 90. Its sequence changes J by -30.0" in sentences
+    assert "J: 100 before, 60 expected, 95 observed. It came out worse than expected." in sentences
+
+
+def test_a_step_says_what_trials_came_to_and_what_perception_saw(text):
+    sentences = words(text)
+    assert "push object 0 by 20 cm to the left harm: something fell off the board" in sentences
+    assert re.search(
+        r"the found target fell over refused push object 0 by 10 cm to the left went as intended chosen", sentences
+    )
+    assert "0 box, 10 × 6 × 16 cm 90 % 0.0 cm" in sentences
+
+
+def test_an_object_that_shows_too_little_is_hidden_and_not_missed():
+    nothing = dataclasses.replace(STEPS[0], scene=OBJECTS.replace(valid=np.zeros(SLOTS, bool)))
+    owner = np.full((20, 20), TARGET)
+    ((*_, words, _, _, wrong),) = shapes(LOST, nothing, owner)
+    assert (words, wrong) == ("hidden", False)
+    ((*_, words, _, _, wrong),) = shapes(LOST, nothing, np.zeros((20, 20), int))
+    assert (words, wrong) == ("not recognised", True)
+    given = dataclasses.replace(EPISODE, config={**EPISODE.config, "recognition": "oracle"})
+    assert shapes(dataclasses.replace(LOST, episode=given), nothing, owner) == []
+
+
+def test_a_page_holds_everything_and_loads_nothing(text):
+    assert len(text) < 3_000_000
+    sources = re.findall(r"\b(?:src|href)=\"([^\"]*)\"", text)
+    assert len(sources) > 8
+    assert all(source.startswith(("data:image/webp;base64,", "#step-")) for source in sources)
+    assert not re.search(r"https?:|<link|@import|url\(|fetch\(|XMLHttpRequest", re.sub(r"base64,[^\"]*", "", text))
+
+
+def test_what_is_shown_is_escaped():
+    evil = "<script>alert(1)</script>"
+    failure = f"found <b>{evil}</b>"
+    steps = (dataclasses.replace(EPISODE.steps[0], failure=evil), EPISODE.steps[1])
+    episode = dataclasses.replace(EPISODE, failure=failure, config={"policy": evil, "max_steps": 1}, steps=steps)
+    text = page(dataclasses.replace(LOST, heading=f"{evil}: lost", episode=episode))
+    assert "alert(1)" in text
+    assert evil not in text
+    assert "<b>" not in text
+
+
+def test_what_an_earlier_recording_lacks_is_left_out_with_a_sentence():
+    sentences = words(page(RECORDING))
+    assert "hidden retrieved" in sentences
+    assert "The recording is of an earlier version" in sentences
+    assert "The record of the episode is missing" in sentences
+    assert "chosen: push object 0 by 10 cm" in sentences
+    assert "tried out" not in sentences
+    assert "confidence off by" not in sentences
+
+
+def test_the_record_beside_an_earlier_recording_is_used(tmp_path):
+    earlier = dataclasses.replace(RECORDING, heading=verdict(EPISODE), steps=RECORDING.steps[:2])
+    save_recording(earlier, tmp_path / NAME)
+    assert recording_with_record(tmp_path).episode is None
+    save_episode(EPISODE, tmp_path / RECORD)
+    assert recording_with_record(tmp_path).episode == EPISODE
+    for other in (RECORDING, dataclasses.replace(earlier, heading="hidden: retrieved")):
+        save_recording(other, tmp_path / NAME)
+        with pytest.raises(InputError, match="is of another episode"):
+            recording_with_record(tmp_path)
+
+
+def test_endings_name_what_happened():
+    def of(failure, steps=EPISODE.steps, recorded=STEPS):
+        episode = dataclasses.replace(EPISODE, failure=failure, steps=steps, found_step=None)
+        return ending(dataclasses.replace(LOST, episode=episode, steps=recorded))
+
+    fell = of("an object fell off the board at action 1", (record(PUSH, fallen=(2,)), EPISODE.steps[1]))
+    assert fell.title == "Lost: an object fell off the board at action 1"
+    assert "Object 2 fell off the board at action 1, “push object 0 by 10 cm" in fell.sentences[0]
+    assert "it had been tried out beforehand and did no harm in the trial" in fell.sentences[0].lower()
+    assert not fell.blockers
+    toppled = of("the target fell over", (record(PUSH, target_fallen=True), EPISODE.steps[1]))
+    assert toppled.sentences[0].startswith("The target fell over at action 1, “push object 0")
+    unseen = of("not found", recorded=(STEPS[0], dataclasses.replace(STEPS[1], found=False, evidence=evidence())))
+    assert unseen.sentences[0].endswith("and the target was never found.")
+    assert unseen.sentences[1].endswith(f"of {POSES} poses, and its true pose is one of them.")
+    assert unseen.sentences[2] == "From the camera it is hidden by object 0 (100 % of it)."
+    moved = "Object 0 was to be moved by 3 of 3 candidates (1 refused after trials) and by the only action."
+    assert unseen.sentences[-1] == moved
+    taking = dataclasses.replace(STEPS[1], action=RETRIEVAL)
+    missed = of("retrieval: missed", (EPISODE.steps[0], record(RETRIEVAL, found=True)), (STEPS[0], taking))
+    assert missed.title == "Lost: the hand missed the target"
+    assert missed.sentences[0] == "The target was to be taken out by action 2, but the hand missed the target."
+    won = ending(dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, retrieved=True, failure=None)))
+    assert won.good
+    assert not won.blockers
+
+
+def lost(failure, found=False, tried=None, **changes):
+    """How an episode ended after a push whose candidates were tried like this."""
+    first = dataclasses.replace(STEPS[0], evidence=evidence(tried=tried), **changes)
+    last = dataclasses.replace(STEPS[1], found=found, evidence=evidence(found=found))
+    episode = dataclasses.replace(EPISODE, failure=failure, found_step=1 if found else None)
+    return ending(dataclasses.replace(LOST, episode=episode, steps=(first, last)))
+
+
+def test_candidates_that_trials_refused_are_counted_once():
+    other = PUSH.replace(object=np.int32(3))
+    results = np.array([TrialResult.HARMFUL, TrialResult.UNKNOWN, TrialResult.FAILED], np.int32)
+    tried = TriedActions(stacked(PUSH.replace(q7=np.float32(1.0)), other, PUSH), results)
+    kept = STEPS[0].sampled
+    of_others = dataclasses.replace(kept, action=kept.action.replace(object=np.full(2, 3, np.int32)))
+    refused = lost("not found", tried=tried, sampled=of_others).sentences[-1]
+    assert refused == "Object 0 was to be moved by 1 of 4 candidates (1 refused after trials) and by the only action."
+    assert lost("not found", sampled=of_others).sentences[-1] == "None of the 2 candidates was to move object 0."
+    # The sequences of a retrieval hold those that were refused.
+    twice = TriedActions(stacked(PUSH, FAR), np.array([TrialResult.HARMFUL, TrialResult.FAILED], np.int32))
+    taking = lost("not found", tried=twice, action=RETRIEVAL)
+    moved = "Object 0 was to be moved by 2 of 2 candidates (1 refused after trials) and by no action."
+    assert taking.sentences[-1] == moved
+
+
+def test_a_push_that_fails_is_no_grasp():
+    assert plain("retrieval: unreachable") == "the arm cannot follow the grasp"
+    assert plain("unreachable") == "the arm cannot follow the action"
+    assert plain("missed") == "missed"
+    steps = (dataclasses.replace(EPISODE.steps[0], failure="unreachable"), EPISODE.steps[1])
+    sentences = words(page(dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, steps=steps))))
+    assert "What went wrong: the arm cannot follow the action." in sentences
+
+
+def test_a_target_that_shows_and_is_not_detected_is_said_so():
+    uncovered = jax.tree.map(np.asarray, from_scenario(HIDDEN))
+    uncovered = uncovered.replace(valid=np.arange(len(uncovered.valid)) == TARGET)
+    last = dataclasses.replace(STEPS[1], found=False, evidence=evidence(), world=uncovered)
+    episode = dataclasses.replace(EPISODE, failure="not found", found_step=None)
+    (first, *_) = ending(dataclasses.replace(LOST, episode=episode, steps=(STEPS[0], last))).sentences
+    assert re.search(r"never found\. It showed \d+ pixels at the last look and was not detected\.$", first)
+
+
+def test_the_protocol_of_the_published_code_ends_well_and_says_what_it_executed():
+    steps = (dataclasses.replace(EPISODE.steps[0], action=record_action(FAR)), EPISODE.steps[1])
+    episode = dataclasses.replace(EPISODE, failure=REACHED, graspable_step=1, steps=steps)
+    reached = dataclasses.replace(LOST, episode=episode)
+    end = ending(reached)
+    assert (end.good, end.title, end.blockers) == (True, "Graspable", ())
+    assert end.sentences[0].startswith("The target was seen after 1 action, and a grasp of it is free.")
+    assert executed_words(LOST, 0) == "push object 0 by 10 cm to the left"
+    assert executed_words(reached, 0) == "push object 0 by 20 cm to the left"
+    sentences = words(page(reached))
+    assert "Executed: push object 0 by 20 cm to the left. What was decided failed" in sentences
+    assert "Lost" not in sentences
+    assert "Executed:" not in words(page(LOST))
+
+
+def test_decisions_are_the_same_with_trials_that_are_noted(problem):
+    codes = np.array([[TrialResult.HARMFUL, TrialResult.FAILED, TrialResult.UNKNOWN]], np.int32)
+    objects = jax.tree.map(jnp.asarray, OBJECTS)
+    sequences = jax.tree.map(jnp.asarray, SEQUENCES)
+    first = jax.tree.map(lambda a: a[0, 0], sequences.actions)
+    alternatives = sequences_to_try(sequences, objects, jnp.float32(0.0))
+    decision = Decision(
+        first,
+        sequences.value[0],
+        jnp.float32(100.0),
+        sequences.cost[0, 0],
+        objects,
+        sequences,
+        alternatives=alternatives,
+    )
+    observation = Observation(objects, jnp.array(False), jnp.zeros(3))
+    for row in (codes, codes[:, ::-1], np.full_like(codes, TrialResult.SUCCEEDED)):
+
+        def trials(problem, scenes, actions, wanted, row=row):
+            return row
+
+        noted = NotedTrials(trials)
+        arguments = (jax.random.key(0), problem, initial_belief(problem), observation)
+        plainly, noting = (decide(lambda *_: decision, each, *arguments) for each in (trials, noted))
+        jax.tree.map(np.testing.assert_array_equal, plainly, noting)
+        assert len(noted.tried(np.arange(SLOTS)).result)
+    assert int(plainly.refused) == 0
+
+
+def test_the_objects_that_hide_the_target_are_named():
+    (first, share), *rest = hidden_behind(RECORDING.steps[0], RECORDING.camera, RECORDING.shelf)
+    assert first == 0
+    assert share > 0.9
+    assert not rest
+    gone = jax.tree.map(np.asarray, from_scenario(HIDDEN))
+    gone = gone.replace(valid=np.arange(len(gone.valid)) == TARGET)
+    assert hidden_behind(step("1  look", world=gone), RECORDING.camera, RECORDING.shelf) == []
+
+
+def test_the_last_state_is_that_after_the_last_action():
+    moved = last_world(RECORDING.steps[0])
+    np.testing.assert_allclose(moved.position[0, 1] - RECORDING.steps[0].world.position[0, 1], 0.1, atol=1e-5)
+    np.testing.assert_allclose(moved.rotation[0], np.eye(3), atol=1e-6)
+    assert last_world(RECORDING.steps[1]) is RECORDING.steps[1].world
+
+
+def test_least_sets_of_what_grasps_hit():
+    hits = np.zeros((4, 5), bool)
+    hits[0, [1]], hits[1, [1, 4]], hits[2, [2, 3]], hits[3, [2, 3, 4]] = True, True, True, True
+    assert least_sets(hits) == [(1,), (2, 3)]
+    assert blocking(hits) == (1,)
+    assert grasps_in_words(hits) == ("each of the 4 grasps that arm and shelf allow hits object 1, or objects 2 and 3")
+    assert grasps_in_words(hits[:0]) == "arm and shelf allow no grasp of the target"
+    assert blocking(np.zeros((1, 5), bool)) == ()
+
+
+def test_trials_are_noted_up_to_the_first_success_with_the_bodies_numbers():
+    codes = [TrialResult.HARMFUL, TrialResult.UNKNOWN, TrialResult.SUCCEEDED, TrialResult.FAILED]
+    noted = NotedTrials(lambda problem, scenes, actions, wanted: np.array([codes], np.int32))
+    push = jax.tree.map(jnp.asarray, PUSH.replace(object=np.int32(1)))
+    actions = jax.tree.map(lambda a: jnp.stack([a] * 4)[None], push)
+    bodies = np.array([3, 5, *range(6)])[:SLOTS]
+    assert len(noted.tried(bodies).result) == 0
+    call = NotedTrials.__call__.__wrapped__
+    results = call(noted, None, None, actions, np.array([[True, False, True, True]]))
+    np.testing.assert_array_equal(results, [codes])
+    tried = noted.tried(bodies)
+    assert tried.result.tolist() == [TrialResult.HARMFUL, TrialResult.SUCCEEDED]
+    assert tried.action.object.tolist() == [5, 5]
+    call(noted, None, None, actions, np.array([[True, True, False, False]]))
+    assert len(noted.tried(bodies).result) == 4
+    assert tried.action.kind.tolist() == [int(PUSH.kind)] * 2
+    assert int(no_action().kind) not in tried.action.kind.tolist()
+
+
+def test_the_command_writes_the_page(tmp_path, capsys):
+    save_recording(LOST, tmp_path / NAME)
+    cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "pages" / "page.html")])()
+    assert "Lost: found, but not graspable" in (tmp_path / "pages" / "page.html").read_text(encoding="utf-8")
+    assert "page.html" in capsys.readouterr().out
+
+
+def test_a_page_that_cannot_be_made_leaves_what_was_there(tmp_path, monkeypatch):
+    (tmp_path / "page.html").write_text("before")
+    monkeypatch.setattr(pages, "page", lambda recording: (_ for _ in ()).throw(RuntimeError("drawn wrong")))
+    with pytest.raises(RuntimeError):
+        pages.save_page(LOST, tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text() == "before"
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_bad_input_is_refused_in_one_line(tmp_path):
+    for arguments, message in (
+        (["--save", str(tmp_path / "page.html")], "recording.npz: there is none; search once more with --record"),
+        (["--save", str(tmp_path / "page.pdf")], "page.pdf: ends in neither .html nor .htm"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)) as refused:
+            cli.parse(["view", str(tmp_path), *arguments])()
+        assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match=r"page.pdf: ends in neither"):
+        cli.parse(["search", "first-light", "--out", str(tmp_path), "--page", str(tmp_path / "page.pdf")])()
+    save_recording(LOST, tmp_path / NAME)
+    with pytest.raises(InputError, match="view: --fps 0 is not between"):
+        cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "page.html"), "--fps", "0"])()
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(InputError, match="cannot be written"):
+        cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "taken" / "page.html")])()
