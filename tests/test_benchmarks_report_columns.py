@@ -7,6 +7,8 @@ import math
 import re
 from html.parser import HTMLParser
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import image
@@ -24,8 +26,11 @@ from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.envs.known_target.judgement import InFullView, judge
+from mechsearch_jax.envs.page import page
+from mechsearch_jax.planner import PRESETS, PlannerConfig
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
@@ -335,10 +340,20 @@ def test_episodes_are_chosen_for_what_they_show(tmp_path):
     # One variant has no picture of all of them.
     assert page.count("<img") == 1 + sum(film.drawn for film in shown)
     assert "no picture: no such scenario" in page
+    assert "explained</a>" not in page
+    # A page beside the picture is linked.
+    first = next(film for film in shown if film.drawn)
+    (tmp_path / "report" / first.page).write_text("a page")
+    again = films.films(rows, tmp_path / "report")
+    assert [film.explained for film in again] == [film.page == first.page for film in again]
+    write_report(dataclasses.replace(Report.of(rows), films=again), tmp_path / "report")
+    assert f'<a href="{first.page}">' in (tmp_path / "report" / "report.html").read_text()
+    assert f"]({first.page})" in (tmp_path / "report" / "report.md").read_text()
     # What is there is not drawn again.
-    count = len(drawn)
+    count, explained = len(drawn), [film.row for film in again if film.explained]
     films.films(rows, tmp_path / "report", draw)
-    assert all(row in lost for row in drawn[count:])
+    without = {episode_key(row) for _, row in chosen} - {episode_key(row) for row in explained}
+    assert {episode_key(row) for row in drawn[count:]} == without
 
 
 def test_a_method_is_what_its_options_say():
@@ -356,14 +371,36 @@ def test_a_method_is_what_its_options_say():
         Method.of_options({**method.options(), "workcell.nowhere.at": 1})
 
 
+def check_evidence(step, row, scenario):
+    """What a recorded step foresees and what grasps of the target hit is what planner and judgement say."""
+    method, weights = Method.of_options(options_of(row)), PlannerConfig().weights
+    world = jax.tree.map(jnp.asarray, step.world)
+    problem = method.workcell.problem(target_of(scenario, method.workcell.target), method.problem_config)
+    judged = judge(problem, InFullView(), weights, world, jnp.array(True))
+    hits = np.asarray(judged.hits)[np.asarray(judged.feasible)]
+    assert hits.any()
+    np.testing.assert_array_equal(step.evidence.hits, hits)
+    foreseen = step.evidence.forecasts
+    assert len(foreseen) == 2
+    # J counts crowding, too.
+    costs = (foreseen.existence * (2.0 - foreseen.graspability)).sum(axis=1)
+    np.testing.assert_allclose(costs, step.sampled.cost[:2], rtol=0.05)
+    assert (costs <= step.sampled.cost[:2]).all()
+
+
 @pytest.mark.slow
-def test_an_episode_is_replayed_from_its_row(tmp_path):
+def test_an_episode_is_replayed_from_its_row(tmp_path, monkeypatch):
     file = example_scenarios()["first-light"]
     (job,) = make_jobs([file], [Method(config=PRESETS["standard"](max_steps=1, sequences=5, horizon=1))], (3,))
     row = InTurn().run(job)
     assert Method.of_options(options_of(row)).options()["max_steps"] == 1
+    recordings = []
+    write = page.save_page
+    monkeypatch.setattr(page, "save_page", lambda shown, path: recordings.append(shown) or write(shown, path))
     assert films.replay(row, load_scenario(file), tmp_path / "film.png") == ""
+    check_evidence(recordings[0].steps[0], row, load_scenario(file))
     assert image.imread(tmp_path / "film.png").std() > 0.05
+    assert "tried out in simulation before acting" in (tmp_path / "film.html").read_text(encoding="utf-8")
     remark = films.replay(dataclasses.replace(row, steps=7), load_scenario(file), tmp_path / "film.png")
     assert remark.startswith("run again on another machine, perhaps, it ended otherwise: ")
     with pytest.raises(InputError, match="holds something else today"):

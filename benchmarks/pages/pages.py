@@ -52,6 +52,15 @@ class Picture:
 
 
 @dataclasses.dataclass(frozen=True)
+class Link:
+    """A link to a file beside the page."""
+
+    kind: ClassVar[str] = "link"
+    text: str
+    file: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Table:
     """A table whose cells are texts without line breaks.
 
@@ -85,7 +94,7 @@ class Table:
             return self.cells.to_html(index=False, border=0, classes=f"texts{self.texts}")
 
 
-Block = Heading | Paragraph | Table | Picture
+Block = Heading | Paragraph | Table | Picture | Link
 
 
 def as_markdown(blocks: Sequence[Block]) -> str:
@@ -101,6 +110,8 @@ def _markdown(block: Block) -> str:
             return text
         case Picture(file, caption):
             return f"![{caption}]({file})"
+        case Link(text, file):
+            return f"[{text}]({file})"
         case Table() if block.folded:
             return block.instead
     # A bar would end the cell.
@@ -130,6 +141,8 @@ def _latex(block: Block) -> str:
                 f"\\includegraphics[width=\\linewidth]{{{file}}}\n"
                 f"\\caption{{{latex_text(caption)}}}\n\\end{{figure}}"
             )
+        case Link(text, file):
+            return latex_text(f"{text}: {file}")
         case Table() if block.folded:
             return latex_text(block.instead)
     # pandas would leave <, > and | as they are.

@@ -1,4 +1,4 @@
-"""Single episodes of a report: which ones to show, and their filmstrips, drawn by running them again."""
+"""Single episodes of a report: which ones to show, their filmstrips and pages, drawn by running them again."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ class Film:
       why: it is shown.
       caption: what is to be known of it.
       drawn: whether there is a picture of it.
+      explained: whether there is a page that explains it.
     """
 
     row: Row
@@ -42,6 +43,7 @@ class Film:
     why: str
     caption: str
     drawn: bool
+    explained: bool = False
 
     @property
     def seed(self) -> int:
@@ -52,6 +54,11 @@ class Film:
     def file(self) -> str:
         """The picture, in the folder of the report."""
         return f"{FOLDER}/{episode_key(self.row)}.png"
+
+    @property
+    def page(self) -> str:
+        """The page that explains it, in the folder of the report."""
+        return f"{FOLDER}/{episode_key(self.row)}.html"
 
 
 def chosen(rows: Sequence[Row]) -> list[tuple[str, Row]]:
@@ -105,31 +112,37 @@ def films(rows: Sequence[Row], out: PathLike, draw: Draw | None = None) -> list[
     Args:
       rows: of the report.
       out: its folder; pictures are in the folder `FOLDER` in it.
-      draw: draws the picture of an episode that is not there into a file, and says what is to be known of it; an
-        `InputError` says why it cannot. If None, nothing is drawn.
+      draw: draws the picture of an episode that is not there into a file, with its page beside it, and says what is to
+        be known of it; an `InputError` says why it cannot. If None, nothing is drawn.
     """
     labels = dict(zip(map(id, rows), label_variants(rows), strict=True))
     notes: dict[str, str] = {}
     shown: list[Film] = []
     for why, row in chosen(rows):
         key, file = episode_key(row), Path(out) / FOLDER / f"{episode_key(row)}.png"
-        if draw is not None and key not in notes and not file.is_file():
+        complete = file.is_file() and file.with_suffix(".html").is_file()
+        if draw is not None and key not in notes and not complete:
             try:
                 notes[key] = draw(row, file)
             except InputError as error:
                 notes[key] = f"no picture: {error}"
         drawn = file.is_file()
         note = notes.get(key, "" if drawn else "no picture; report --films draws it")
-        shown.append(Film(row, labels[id(row)], why, f"{_caption(row)}{note and f' ({note})'}", drawn))
+        caption = f"{_caption(row)}{note and f' ({note})'}"
+        shown.append(Film(row, labels[id(row)], why, caption, drawn, file.with_suffix(".html").is_file()))
     return shown
 
 
 class Frames:
     """A `Watcher` that keeps a frame of every step."""
 
-    def __init__(self, problem: Any) -> None:
+    def __init__(self, problem: Any, note: Callable[[Any, Any], None]) -> None:
+        """Args:
+        problem: of the episode.
+        note: called after every step with its moment and its frame.
+        """
         self.frames: list[Any] = []
-        self._problem = problem
+        self._problem, self._note = problem, note
 
     def busy(self, stage: str) -> None:
         """Nothing is said."""
@@ -142,10 +155,11 @@ class Frames:
         from mechsearch_jax.envs.recording import pictures
 
         self.frames.append(pictures.frame(moment, self._problem))
+        self._note(moment, self.frames[-1])
 
 
 def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
-    """Run an episode again in the native simulator, and draw its filmstrip.
+    """Run an episode again in the native simulator, draw its filmstrip, and write its page beside that.
 
     Returns:
       What is to be known of the picture: empty where the episode ended as its row says.
@@ -157,8 +171,11 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     from mechsearch_jax.envs.episode.closed_loop import Start
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.episode.method import Method
+    from mechsearch_jax.envs.page.page import save_page
     from mechsearch_jax.envs.recording.narration import verdict
+    from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
     from mechsearch_jax.envs.simulators.native import NativeSimulator
+    from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.filmstrip import filmstrip
 
@@ -169,16 +186,20 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     workcell = method.workcell
     target = target_of(scenario, workcell.target)
     problem = workcell.problem(target, method.problem_config)
-    watcher = Frames(problem)
+    simulation = SimulatorConfig(trace_every=TRACE_EVERY)
+    simulator = NativeSimulator(config=simulation, shelf=workcell.shelf, camera=workcell.camera)
+    recorder = Recorder(simulator, problem)
+    watcher = Frames(problem, recorder.note)
     episode = run_episode(
         Start(scenario, row.seed, mismatch=method.mismatch),
         problem,
         method.policy(),
-        NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
+        simulator,
         run_settings(method, target),
         watcher,
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
+    save_page(recorder.recording(problem, verdict(episode), episode), Path(file).with_suffix(".html"))
     again = Row.of_episode(episode)
     if all(getattr(row, name) == getattr(again, name) for name in _END):
         return ""

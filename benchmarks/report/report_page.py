@@ -6,7 +6,7 @@ import collections
 import dataclasses
 from collections.abc import Sequence
 
-from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Paragraph, Picture, Table
+from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Link, Paragraph, Picture, Table
 from mechsearch_jax.benchmarks.report.report import (
     Report,
     changed_scenarios_remark,
@@ -251,5 +251,7 @@ def _films(report: Report) -> list[Block]:
         caption = f"{report.key.short[film.method]}, seed {film.seed}: {film.caption}"
         block = Picture(film.file, caption) if film.drawn else Paragraph(caption)
         groups.setdefault(film.why, []).append(block)
+        if film.explained:
+            groups[film.why].append(Link(f"Every decision of {film.row.scenario} explained", film.page))
     parts = [[Heading(why, 3), *films] for why, films in groups.items()]
     return [Heading("Single episodes"), *(block for part in parts for block in part)]
