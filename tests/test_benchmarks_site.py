@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,13 @@ from PIL import Image
 from recordings import RECORDING
 from stored_rows import USUAL, row_of
 
-from mechsearch_jax.benchmarks.site import all_pages, method_pictures, set_pages
+from mechsearch_jax.benchmarks.site import all_pages, gallery, method_pictures, set_pages
 from mechsearch_jax.benchmarks.site.set_texts import ABOUT, sets_of
 from mechsearch_jax.benchmarks.statistics.variants import Key
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.commands.options import find_scenario
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.page.page import stamp
 from mechsearch_jax.envs.recording.recording import save_recording
 from mechsearch_jax.envs.scenes.scene_sets import SETS, recorded
 from mechsearch_jax.envs.world.world import from_scenario
@@ -215,3 +219,71 @@ def test_outside_a_checkout_nothing_is_written(tmp_path, monkeypatch, capsys):
     assert end.value.code == 2
     assert "give the folder of the stored results as --results" in capsys.readouterr().err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
+
+
+GALLERY = ROOT / "docs/gallery"
+DRAW = f"what writes pages has changed; run `python -m {gallery.__name__} --recordings FOLDER`"
+
+
+def test_the_gallery_declares_searches_that_the_command_line_takes():
+    episodes = gallery.declared()
+    assert len(episodes) == 12
+    for episode in episodes:
+        assert callable(cli.parse(["search", *episode.search, "--out", "out"]))
+        find_scenario(episode.search[0])
+
+
+def test_the_index_lists_the_pages_that_are_there():
+    episodes = gallery.declared()
+    text = gallery.index(episodes, GALLERY)
+    assert (GALLERY / "index.md").read_text(encoding="utf-8") == text
+    pages = sorted(GALLERY.glob("*.html"))
+    assert {page.stem for page in pages} <= {episode.name for episode in episodes}
+    assert all(f"]({page.name})" in text for page in pages)
+    assert sum(page.stat().st_size for page in pages) < gallery.ALL
+    for page in pages:
+        words = re.sub(r"base64,[^\"]*", "", page.read_text(encoding="utf-8"))
+        assert not re.search(r"https?:|file:", words), page.name
+        assert "of an earlier version" not in words
+        assert f'content="mechsearch view --save {stamp()}"' in words, f"{page.name}: {DRAW}"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("episode = 3", "declares no gallery"),
+        ("[[episode]]\nname = 'a'", "declares no gallery"),
+        ("[[episode]]\nname = 'A b'\ntitle = ''\nshows = ''\nsearch = []", "names are of small letters"),
+    ],
+)
+def test_a_wrong_declaration_is_refused_in_one_line(text, message, tmp_path):
+    (tmp_path / "gallery.toml").write_text(text)
+    with pytest.raises(InputError, match=message) as refused:
+        gallery.declared(tmp_path / "gallery.toml")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_gallery_is_drawn_of_the_recordings_that_are_there(tmp_path, monkeypatch, capsys):
+    save_recording(RECORDING, tmp_path / "recordings" / "easy" / "recording.npz")
+
+    def run(program, **options):
+        assert program[3:5] == ["view", str(tmp_path / "recordings" / "easy")]
+        cli.parse(program[3:])()
+        return types.SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(gallery.subprocess, "run", run)
+    gallery.main(["easy", "--out", str(tmp_path), "--recordings", str(tmp_path / "recordings")])
+    text = (tmp_path / "index.md").read_text(encoding="utf-8")
+    assert "[An easy search](easy.html)" in text
+    assert "| retrieved |" in text
+    assert text.count(".html") == 1
+    with pytest.raises(SystemExit):
+        gallery.main(["easy", "--index"])
+    assert "--index writes the list alone" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        gallery.main(["nothing"])
+    assert "nothing is no episode of the gallery; there are easy," in capsys.readouterr().err
+    monkeypatch.setattr(gallery.subprocess, "run", lambda program: types.SimpleNamespace(returncode=3))
+    with pytest.raises(SystemExit):
+        gallery.main(["crowded", "--out", str(tmp_path)])
+    assert "mechsearch search crowded-shelf --out" in capsys.readouterr().err
