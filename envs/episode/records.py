@@ -165,7 +165,7 @@ def load_episode(path: PathLike) -> Episode:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
 
 
-def episode_of(value: dict[str, Any]) -> Episode:
+def episode_of(value: Any) -> Episode:
     """An episode from its JSON values.
 
     Raises:
@@ -174,7 +174,7 @@ def episode_of(value: dict[str, Any]) -> Episode:
     return Episode(**{**value, "steps": tuple(_step(step) for step in value["steps"])})
 
 
-def _step(value: dict[str, Any]) -> Step:
+def _step(value: Any) -> Step:
     """A step from its JSON values."""
     action, fallen = value["action"], value.get("fallen")
     return Step(
