@@ -76,7 +76,7 @@ def test_pushes_begin_a_gap_away_from_their_object_and_most_meet_it_then(shape, 
         assert not any(inside(by).any() for by in np.linspace(0.0, CONFIG.push_gap - 1e-4, 6))
         meets.append(any(inside(by).any() for by in np.linspace(CONFIG.push_gap, 0.02, 21)))
     # Others graze the margin around the object, or a corner, first.
-    assert np.mean(meets) > 0.6
+    assert np.mean(meets) > 0.5
 
 
 @pytest.mark.parametrize("shape", SHAPES)
