@@ -136,7 +136,7 @@ def retype_confidence(arrays):
 
 
 @pytest.mark.parametrize("spoil", [halve_hits, forget_results, invent_results, negate_rows, retype_confidence])
-def test_spoilt_evidence_is_refused_in_one_line(spoil, tmp_path):
+def test_damaged_evidence_is_refused_in_one_line(spoil, tmp_path):
     save_recording(LOST, tmp_path / NAME)
     with np.load(tmp_path / NAME) as file:
         arrays = dict(file)

@@ -200,7 +200,7 @@ def _rows(arrays: Mapping[str, np.ndarray], name: str, like: np.ndarray, steps: 
     counts = _checked(arrays, f"{name}.rows", (steps,), np.dtype(int))
     if counts.min() < 0:
         raise ValueError("a number of rows is negative")
-    # Compared before anything of that size is made: a spoilt file may claim any number of rows.
+    # Compared before anything of that size is made: a damaged file may claim any number of rows.
     whole = _checked(arrays, name, (int(counts.sum()), *like.shape[1:]), like.dtype)
     return np.split(whole, np.cumsum(counts)[:-1])
 
