@@ -25,7 +25,8 @@ from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.physics import COARSE_STEP, FINE_STEP, PHYSICS
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls, resampled
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
-from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.envs.world.model import body_geometries
+from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.noise import no_noise
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -56,9 +57,9 @@ def degrees(rotation):
     return np.degrees(np.arccos(np.clip((np.trace(np.asarray(rotation, float)) - 1) / 2, -1, 1)))
 
 
-def model_of(cell):
+def model_of(cell, scene=SCENE):
     world = NativeWorld()
-    world.reset(SCENE, cell)
+    world.reset(scene, cell)
     return world._model, world._data
 
 
@@ -85,6 +86,42 @@ def test_friction_and_mass_are_what_mujoco_sees():
     np.testing.assert_allclose(other.body_inertia[used], 0.5 * usual.body_inertia[used])
     links = [usual.body(f"link{i}").id for i in range(1, 8)]
     np.testing.assert_array_equal(other.body_mass[links], usual.body_mass[links])
+
+
+def test_each_body_has_a_friction_and_a_mass_of_its_own():
+    scene = HIDDEN
+    one, two, mass = (
+        cell_of(Mismatch(**spread), scene)
+        for spread in ({"friction_spread": 1.5}, {"friction_spread": 2.0}, {"mass_spread": 2.0})
+    )
+    for cell in (one, two):
+        np.testing.assert_array_equal(cell.body_mass, 1.0)
+    # The same share of every spread.
+    np.testing.assert_allclose(np.log(one.body_friction) / np.log(1.5), np.log2(two.body_friction))
+    assert len(set(two.body_friction)) == BODIES
+    assert 0.5 <= two.body_friction.min() < 0.9
+    assert 1.1 < two.body_friction.max() <= 2.0
+    usual, other, heavier = (model_of(cell, scene)[0] for cell in (ASSUMED_CELL, two, mass))
+    geometries = body_geometries(usual)
+    ratio = other.geom_friction[:, 0] / np.where(usual.geom_friction[:, 0] > 0, usual.geom_friction[:, 0], 1.0)
+    np.testing.assert_allclose(ratio[geometries], np.broadcast_to(two.body_friction[:, None], geometries.shape))
+    rest = np.setdiff1d(np.arange(usual.ngeom), geometries)
+    np.testing.assert_array_equal(other.geom_friction[rest], usual.geom_friction[rest])
+    slots = [usual.body(f"body{i}").id for i in range(BODIES)]
+    np.testing.assert_allclose(heavier.body_mass[slots] / usual.body_mass[slots], mass.body_mass)
+    np.testing.assert_allclose(heavier.body_inertia[slots], mass.body_mass[:, None] * usual.body_inertia[slots])
+
+
+def test_what_is_more_slippery_slides_farther():
+    """A body that is given a push over the board comes to rest sooner with twice its own friction."""
+    ways = []
+    for factor in (1.0, 2.0):
+        model, data = model_of(ASSUMED_CELL._replace(body_friction=np.full(BODIES, factor)))
+        start = data.joint("body0").qpos.copy()
+        data.joint("body0").qvel[:] = [0.0, -0.4, 0.0, 0.0, 0.0, 0.0]
+        mujoco.mj_step(model, data, nstep=300)
+        ways.append(np.linalg.norm(data.joint("body0").qpos[:2] - start[:2]))
+    assert ways[0] > 1.3 * ways[1] > 1e-3
 
 
 def test_directions_belong_to_scene_and_seed_not_to_lengths():

@@ -66,7 +66,7 @@ def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     blank = model.compile_model(Shelf(), Camera())
     scenes = [scene(BOX, BOTTLE), scene(), scene(*[BOTTLE] * 8, target=standing("box", (0.015, 0.02, 0.05), 0.6, 0.1))]
     worlds = stack(*[from_scenario(s) for s in scenes])
-    moved = Mismatch(friction=0.5, mass=2.0, shelf_shift=0.01, shelf_turn=2.0)
+    moved = Mismatch(friction=0.5, mass=2.0, friction_spread=2.0, mass_spread=1.5, shelf_shift=0.01, shelf_turn=2.0)
     cells = [ASSUMED_CELL, moved.drawn(scenes[1], 0, Camera(), Shelf()), ActualCell(friction=2.0)]
     fields = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid, cells_of(blank, cells))
     for i, (start, cell) in enumerate(zip(scenes, cells, strict=True)):

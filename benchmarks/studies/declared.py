@@ -259,6 +259,8 @@ def _shelf(name: str, question: str) -> Study:
     )
 
 
+_EACH_DRAWN = Mismatch(friction_spread=2.0, mass_spread=2.0)
+
 _ROBUSTNESS = (
     Study(
         "friction",
@@ -283,6 +285,18 @@ _ROBUSTNESS = (
         _factors("mass", lambda factor: Mismatch(mass=factor)),
         axis="true masses as a multiple of what trials assume",
         logarithmic=True,
+    ),
+    Study(
+        "friction-and-mass",
+        "What if friction and mass of each body are drawn anew, from half to twice what trials assume?",
+        IMAGE_SCENES,
+        (
+            Variant("as assumed"),
+            *(
+                Variant(f"drawn, {label}", {"rehearsal": name, "mismatch": _EACH_DRAWN})
+                for label, name in (("assumed", "physics"), ("learned", "learning"), ("no trials", "none"))
+            ),
+        ),
     ),
     Study(
         "calibration",

@@ -48,11 +48,13 @@ class Cells(flax.struct.PyTreeNode):
     """How the worlds differ from what the planner assumes: what of an `ActualCell` this simulator's model holds.
 
     Attributes:
-      friction, mass: factors on sliding frictions, and on the bodies' masses and inertias, shape (worlds,).
+      friction: factors on all sliding frictions, shape (worlds,).
+      body_friction, mass: factors on the sliding friction, and on mass and inertia, of each body, shape (worlds, 9).
       position, quaternion: of the robot's first link in the world, shapes (worlds, 3) [m] and (worlds, 4).
     """
 
     friction: jax.Array
+    body_friction: jax.Array
     mass: jax.Array
     position: jax.Array
     quaternion: jax.Array
@@ -63,7 +65,8 @@ def cells_of(blank: mujoco.MjModel, cells: Sequence[ActualCell]) -> Cells:
     poses = [models.base_pose(blank, cell.T_world_base) for cell in cells]
     columns = (
         [cell.friction for cell in cells],
-        [cell.mass for cell in cells],
+        [cell.body_friction for cell in cells],
+        [cell.mass * cell.body_mass for cell in cells],
         [position for position, _ in poses],
         [quaternion for _, quaternion in poses],
     )
@@ -88,7 +91,7 @@ def body_fields(
     mass, inertia = models.masses_and_inertias(kind, half_size, jnp)
     mass = jnp.where(valid, mass, models.EMPTY_MASS)
     inertia = jnp.where(valid[..., None], inertia, models.EMPTY_INERTIA)
-    mass, inertia = cells.mass[:, None] * mass, cells.mass[:, None, None] * inertia
+    mass, inertia = cells.mass * mass, cells.mass[..., None] * inertia
 
     fields = {}
     for name in BodyFields.__dataclass_fields__:
@@ -96,6 +99,8 @@ def body_fields(
         fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
 
     fields["geom_friction"] = fields["geom_friction"].at[:, :, 0].multiply(cells.friction[:, None])
+    slots = models.body_geometries(blank)
+    fields["geom_friction"] = fields["geom_friction"].at[:, slots, 0].multiply(cells.body_friction[..., None])
 
     def put(name: str, where: np.ndarray | int, value: Array) -> None:
         fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))

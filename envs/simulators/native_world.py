@@ -148,8 +148,9 @@ class NativeWorld:
           cell: with the factors on sliding frictions and masses, the physics, and where the robot stands.
         """
         self._bodies = bodies
-        self._model = models.with_bodies(self._blank, bodies, mass=cell.mass)
+        self._model = models.with_bodies(self._blank, bodies, mass=cell.mass * cell.body_mass)
         self._model.geom_friction[:, 0] *= cell.friction
+        self._model.geom_friction[models.body_geometries(self._blank), 0] *= cell.body_friction[:, None]
         models.move_robot(self._model, cell.T_world_base)
         PHYSICS[cell.physics](self._model)
         self._data = models.initial_state(self._model, bodies)

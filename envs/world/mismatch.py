@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.config.config import Option
+from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.runtime.options import option
 from mechsearch_jax.workspace.camera import Camera
@@ -45,6 +46,8 @@ class Mismatch:
     Attributes:
       friction: factor on all sliding frictions.
       mass: factor on the masses and inertias of all bodies on the shelf.
+      friction_spread, mass_spread: each body's sliding friction, and its mass and inertia, are multiplied by a further
+        factor of its own, between 1 / spread and spread; its logarithm is uniformly distributed. 1: none.
       physics: contacts and time step of the simulation, one of `simulators.physics.PHYSICS`.
       arm_stop: an arm with a joint farther than this from its reference stops and goes back the way it came [rad]; 0:
         it goes on, as trials take it to. Ordinary actions reach 0.027.
@@ -62,6 +65,10 @@ class Mismatch:
 
     friction: float = option(1.0, "factor on the simulated world's sliding frictions")
     mass: float = option(1.0, "factor on the masses of the simulated bodies")
+    friction_spread: float = option(
+        1.0, "each body's friction is drawn between this many times less and more than it would be"
+    )
+    mass_spread: float = option(1.0, "each body's mass is drawn between this many times less and more than it would be")
     physics: PhysicsName = option("usual", "contacts and time step of the simulated world", get_args(PhysicsName))
     arm_stop: float = option(
         0.0, "joint error at which the simulated arm stops and goes back [rad]; 0.03 or more; 0: never"
@@ -81,6 +88,8 @@ class Mismatch:
         for name, low, high, unit in (
             ("friction", 0.01, 100.0, ""),
             ("mass", 0.01, 100.0, ""),
+            ("friction_spread", 1.0, 10.0, ""),
+            ("mass_spread", 1.0, 10.0, ""),
             ("arm_stop", 0.0, LARGEST_STOP, "rad"),
             ("camera_shift", 0.0, FARTHEST, "m"),
             ("camera_turn", 0.0, STEEPEST, "degrees"),
@@ -123,7 +132,9 @@ class Mismatch:
     @property
     def simulates_otherwise(self) -> bool:
         """Whether the simulator has to differ from the usual."""
-        return self.moves_robot or (self.friction, self.mass, self.physics, self.arm_stop) != (1.0, 1.0, "usual", 0.0)
+        usual = ActualCell()
+        alike = (self.friction, self.mass, self.physics, self.arm_stop) == (*usual[:3], usual.arm_stop)
+        return self.moves_robot or not alike or max(self.friction_spread, self.mass_spread) > 1.0
 
     def mould(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
@@ -149,8 +160,9 @@ class Mismatch:
     def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> ActualCell:
         """The cell of an episode, constant until its end.
 
-        Directions and axes are uniformly distributed and drawn from what the scenario holds and the episode's seed.
-        They do not depend on how far anything is shifted or turned, so that a sweep compares like with like.
+        Directions, axes and the bodies' shares of a spread are drawn from what the scenario holds and the episode's
+        seed. They do not depend on how far anything is shifted or turned, or on the spread, so that a sweep compares
+        like with like.
 
         Args:
           scenario, seed: of the episode.
@@ -160,12 +172,22 @@ class Mismatch:
         vectors = random.normal(size=(4, 3))
         camera_way, camera_axis, shelf_way, shelf_axis = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
         middle = np.array([(shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board])
+        friction_share, mass_share = random.uniform(-1.0, 1.0, size=(2, BODIES))
         # To move robot and camera one way is to move the shelf the other way.
         T_world_base = _motion(-self.shelf_shift * shelf_way, -self.shelf_turn * shelf_axis, middle)
         T_base_moved = _motion(
             self.camera_shift * camera_way, self.camera_turn * camera_axis, np.array(camera.position)
         )
-        return ActualCell(self.friction, self.mass, self.physics, T_world_base, T_base_moved, self.arm_stop)
+        return ActualCell(
+            self.friction,
+            self.mass,
+            self.physics,
+            T_world_base,
+            T_base_moved,
+            self.arm_stop,
+            self.friction_spread**friction_share,
+            self.mass_spread**mass_share,
+        )
 
 
 class ActualCell(NamedTuple):
@@ -176,6 +198,7 @@ class ActualCell(NamedTuple):
       T_world_base: where the robot's base stands; the identity where the planner takes it to.
       T_base_moved: what moves the camera, in the base's frame, from where the planner takes it to be to where it is.
       arm_stop: as of `Mismatch`.
+      body_friction, body_mass: further factors on the sliding friction, and on mass and inertia, of each body.
     """
 
     friction: float = 1.0
@@ -184,6 +207,8 @@ class ActualCell(NamedTuple):
     T_world_base: Float[np.ndarray, "4 4"] = np.eye(4)
     T_base_moved: Float[np.ndarray, "4 4"] = np.eye(4)
     arm_stop: float = 0.0
+    body_friction: Float[np.ndarray, " 9"] = np.ones(BODIES)
+    body_mass: Float[np.ndarray, " 9"] = np.ones(BODIES)
 
 
 # As the planner assumes.
@@ -200,7 +225,8 @@ def _motion(shift: np.ndarray, turn: np.ndarray, pivot: np.ndarray) -> Float[np.
 
 
 def _option(field: dataclasses.Field[Any]) -> Option:
-    name = f"world_{field.name}" if field.name in ("friction", "mass", "physics") else field.name
+    of_world = ("friction", "mass", "friction_spread", "mass_spread", "physics")
+    name = f"world_{field.name}" if field.name in of_world else field.name
     choices = field.metadata["choices"]
     return Option(name, (field.name,), str if choices else float, field.metadata["help"], choices)
 

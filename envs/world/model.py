@@ -319,7 +319,10 @@ def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
 
 
 def with_bodies(
-    model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN, mass: float = 1.0
+    model: mujoco.MjModel,
+    bodies: Sequence[Body | None],
+    skin: float = MARGIN,
+    mass: float | Float[np.ndarray, " 9"] = 1.0,
 ) -> mujoco.MjModel:
     """A copy of the model whose slots have the shapes and masses of `bodies`; poses belong to the state.
 
@@ -327,13 +330,14 @@ def with_bodies(
       model: the compiled model.
       bodies: one for each slot, the target last; None leaves a slot empty.
       skin: how much smaller the contact geometry is than the bodies [m]; 0 for pictures.
-      mass: factor on the bodies' masses and inertias.
+      mass: factor on the bodies' masses and inertias, or one for each.
     """
     model = copy.copy(model)
+    factors = np.broadcast_to(mass, len(bodies))
     for i, body in enumerate(bodies):
         index = model.body(f"body{i}").id
         body_mass, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
-        model.body_mass[index], model.body_inertia[index] = mass * body_mass, mass * inertia
+        model.body_mass[index], model.body_inertia[index] = factors[i] * body_mass, factors[i] * inertia
         model.body_gravcomp[index] = 0.0 if body else 1.0
         for shape in in_order():
             used = body is not None and body.shape == shape.name
@@ -344,6 +348,11 @@ def with_bodies(
             model.geom_aabb[geom] = [0.0, 0.0, 0.0, *half]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def body_geometries(model: mujoco.MjModel) -> Int[np.ndarray, "9 shapes"]:
+    """The numbers of the geometries in each body's slot, one for each shape."""
+    return np.array([[model.geom(geometry_name(shape, i)).id for shape in in_order()] for i in range(BODIES)])
 
 
 def base_pose(
