@@ -1,6 +1,7 @@
 """The studies that there are.
 
-Ablations run on `development`, since they choose what the default has; all others on scenes that nothing was chosen on.
+Ablations run on `development`, since they choose what the default has, and `extensions-full`, which chooses, too, on
+scenes that were looked at before; all others on scenes that nothing was chosen on.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from mechsearch_jax.envs.world.mismatch import Mismatch
 
 ABLATION_SCENES, REPORT_SCENES = "development", "report-a"
 # A set for each later question, since a set that was looked at is no longer unseen.
-IMAGE_SCENES, CONFIRMATION_SCENES = "report-b", "report-c"
+IMAGE_SCENES, CONFIRMATION_SCENES, DEFAULT_SCENES = "report-b", "report-c", "report-d"
 _VIEWS = Path(__file__).parents[1] / "parts" / "views"
 STANDARD = Variant("standard")
 
@@ -166,6 +167,11 @@ _ABLATIONS = (
 # What gained nothing on `development`, each by itself, and could be left out of the default.
 _LEFT_OUT = {"reopen": False, "closer_look": 0, "erosion": 0.0, "cell_reach": (0.5,), "move_target": False}
 
+# What may take the default's place: it looks one action ahead, and leaves two extensions out.
+_THREE_AHEAD = {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001}
+_ONE_AHEAD = {"horizon": 1, "sequences": 300, "move_target": False, "erosion": 0.0}
+_FULL = {"recognition": "full"}
+
 _CONFIRMATIONS = (
     Study(
         "images",
@@ -192,6 +198,32 @@ _CONFIRMATIONS = (
             Variant("what gained nothing left out", _LEFT_OUT),
             Variant("full", {"recognition": "full"}),
             Variant("full, what gained nothing left out", {"recognition": "full", **_LEFT_OUT}),
+        ),
+    ),
+    Study(
+        "extensions-full",
+        "What does each extension gain through images, when it alone is left out?",
+        CONFIRMATION_SCENES,
+        (
+            Variant("full", _FULL),
+            Variant("collision-free grasps only", {**_FULL, "retrieval_contact": False}),
+            Variant("a found target stays", {**_FULL, "move_target": False}),
+            Variant("no margin of a cell", {**_FULL, "cell_reach": (0.5,)}),
+            Variant("no erosion", {**_FULL, "erosion": 0.0}),
+            Variant("f never reopened", {**_FULL, "reopen": False}),
+            Variant("one ahead, 300 sequences", {**_FULL, "horizon": 1, "sequences": 300}),
+        ),
+        chooses=True,
+    ),
+    Study(
+        "one-ahead",
+        "Is it as good to look one action ahead, with more of them, and to leave out what gained nothing?",
+        DEFAULT_SCENES,
+        (
+            Variant("three ahead, full", {**_FULL, **_THREE_AHEAD}),
+            Variant("one ahead, full", {**_FULL, **_ONE_AHEAD}),
+            Variant("three ahead, true shapes", _THREE_AHEAD),
+            Variant("one ahead, true shapes", _ONE_AHEAD),
         ),
     ),
 )

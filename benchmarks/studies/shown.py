@@ -87,7 +87,7 @@ def source(shown_study: ShownStudy) -> str:
     first = find_set(study.scenes).blocks[0].scene_name(0)
     ran, declared = len({row.scenario for row in rows}), find_set(study.scenes).scenes
     part = f"{ran:,} of the {declared:,} scenes of " if ran < declared else ""
-    which = "settings were chosen on" if is_chosen_on(first) else "nothing was chosen on"
+    which = "settings were chosen on" if study.chooses or is_chosen_on(first) else "nothing was chosen on"
     missing = [v.label for v in study.variants if v.label not in {c.variant.label for c in shown_study.comparisons}]
     lacks = f" Not run: {', '.join(missing)}." if missing else ""
     devices = ", ".join(sorted({row.device or "unknown" for row in rows}))
