@@ -14,7 +14,7 @@ from recordings import MOVES, RECORDING, RESTS, SAMPLED, SEQUENCES, WORLD
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.recording.film import Film
 from mechsearch_jax.envs.recording.pictures import recorded_frame
-from mechsearch_jax.envs.recording.playback import ENDS, LOOKS, WAY_TIME, playback
+from mechsearch_jax.envs.recording.playback import ENDS, LOOKS, WAY_TIME, Playback, playback
 from mechsearch_jax.envs.recording.recording import (
     NAME,
     Recorder,
@@ -196,6 +196,19 @@ def test_a_film_shows_the_robot_the_map_and_what_the_camera_saw(tmp_path):
 
 
 FADING = [np.full((32, 48, 3), shade, np.uint8) for shade in range(20, 240, 20)]
+
+
+def test_a_robot_that_stands_still_is_drawn_once_and_shown_as_often(played, monkeypatch):
+    still = [row for row in range(len(played.time)) if played.is_still(row)]
+    assert not played.is_still(0)
+    assert 1 in still
+    moves = np.flatnonzero(np.any(np.diff(played.q, axis=0), axis=1)) + 1
+    assert not set(moves.tolist()) & set(still)
+    assert len(still) > 10
+    film = Film(RECORDING, 320, 5)
+    shown = list(film)
+    monkeypatch.setattr(Playback, "is_still", lambda self, row: False)
+    assert all(np.array_equal(a, b) for a, b in zip(shown, film, strict=True))
 
 
 def test_a_movie_is_what_its_ending_says(tmp_path):

@@ -3,15 +3,22 @@
 import threading
 import time
 
+import jax
 import pytest
 
 from mechsearch_jax.actions import KINDS
+from mechsearch_jax.belief.belief import graspability_map, initial_belief
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
+from mechsearch_jax.envs.episode import verdicts
+from mechsearch_jax.envs.recording import evidence
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.retrieval import best_grasp, worth_trying
 from mechsearch_jax.robot.motion import MotionConfig
-from mechsearch_jax.session.preparing import Program, first_decision, motions, prepare, prepared
+from mechsearch_jax.session import preparing
+from mechsearch_jax.session.preparing import Preparing, Program, first_decision, motions, prepare, prepared
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 
@@ -55,6 +62,52 @@ def test_the_block_runs_meanwhile():
     assert not both.broken
 
 
+def test_what_is_added_later_is_reported_with_what_is_left():
+    lines, first = [], threading.Event()
+    with Preparing(lines.append) as preparing:
+        preparing.add([program("a", prepare=lambda: first.wait(20))])
+        preparing.add([program("b", ready=True), program("c", prepare=lambda: first.wait(20))])
+        first.set()
+    assert lines[:2] == ["compiling: a; 0 of 1 done", "compiling: a, c; 0 of 2 done"]
+    assert lines[-1] == "compiling; 2 of 2 done"
+
+
+def test_what_is_optional_is_prepared_without_a_word():
+    lines, begun = [], threading.Event()
+    with Preparing(lines.append) as preparing:
+        preparing.add([program("a", prepare=begun.set)], optional=True)
+        assert begun.wait(20)
+    assert lines == []
+
+
+def test_the_end_of_the_block_neither_begins_nor_waits_for_what_is_optional(monkeypatch):
+    monkeypatch.setenv("MECHSEARCH_CORES", "2")
+    ends, running, begun = threading.Event(), threading.Semaphore(0), []
+
+    def begin(name):
+        begun.append(name)
+        running.release()
+        return lambda: ends.wait(20)
+
+    with Preparing(lambda line: None) as preparing:
+        optional = [Program(name, lambda: False, lambda name=name: begin(name)) for name in ("a", "b", "c")]
+        preparing.add(optional, optional=True)
+        assert all(running.acquire(timeout=20) for _ in range(2))
+        began = time.monotonic()
+    assert time.monotonic() - began < 10
+    # The third has waited for a core.
+    ends.set()
+    time.sleep(0.2)
+    assert begun == ["a", "b"]
+
+
+def test_what_is_needed_is_waited_for_at_the_end():
+    done = []
+    with Preparing(lambda line: None) as preparing:
+        preparing.add([program("a", prepare=lambda: (time.sleep(0.2), done.append("a")))])
+    assert done == ["a"]
+
+
 def test_what_is_wrong_is_said_by_who_calls_it():
     def fail():
         raise ValueError("cannot be compiled")
@@ -77,6 +130,36 @@ def test_a_policy_of_a_users_own_is_compiled_when_it_is_called(problem):
     others = ["belief", *(f"motion of {kind.name}" for kind in KINDS.values())]
     assert names(lambda *_: None) == others
     assert names(search_for_grasp()) == ["plan", *others]
+
+
+def test_what_later_steps_need_is_what_they_call(problem, monkeypatch):
+    """The programs that a search compiles ahead are for the arguments that it then has."""
+    calls = {}
+
+    def noted(name, function, *args):
+        calls.setdefault(name, []).append((function, args))
+        return program(name)
+
+    for module in (preparing, verdicts, evidence):
+        monkeypatch.setattr(module, "program", noted)
+    policy = search_for_grasp(tries=True)
+    preparing.retrieval(problem, policy)
+    verdicts.programs(problem)
+    evidence.programs(problem)
+    snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(load_scenario(example_scenarios()["first-light"])))
+    seen, pose = oracle(jax.random.key(0), snapshot), true_target_pose(snapshot.world)
+    there, belief = objects_on_the_board(snapshot), initial_belief(problem)
+    expected = {
+        "grasp": [(worth_trying, (problem.target_grasps, seen.objects, belief.found_pose))],
+        "verdict": [(best_grasp, (grasps, there, pose)) for grasps in verdicts.judged_sets(problem)],
+        "hits": [(evidence.grasps_at, (problem.target_grasps, there, pose))],
+        "g": [(graspability_map, (problem, belief, seen.objects))],
+    }
+
+    def keys(each):
+        return {name: [(f, f._call_key(args, {})) for f, args in pairs] for name, pairs in each.items()}
+
+    assert keys(calls) == keys(expected)
 
 
 def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):

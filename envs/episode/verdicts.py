@@ -19,6 +19,7 @@ from mechsearch_jax.planner import Problem, paper
 from mechsearch_jax.retrieval import TargetGrasps, best_grasp, no_grasps, straight_hits, target_grasps
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.session.preparing import Program, nothing_seen, program
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 from mechsearch_jax.workspace.target import Target
@@ -56,6 +57,12 @@ def judge(problem: Problem, snapshot: Snapshot) -> Verdict:
     # Called as the policies call it, so that nothing is compiled twice.
     free = [best_grasp(grasps, objects, pose).success for grasps in judged_sets(problem)]
     return Verdict(*map(bool, jax.device_get(free)))
+
+
+def programs(problem: Problem) -> list[Program]:
+    """The programs of `judge` that take long to compile."""
+    objects, pose = nothing_seen().objects, jnp.zeros(3)
+    return [program("verdict", best_grasp, grasps, objects, pose) for grasps in judged_sets(problem)]
 
 
 def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> list[Verdict]:

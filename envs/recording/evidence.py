@@ -21,10 +21,11 @@ from mechsearch_jax.envs.recording.sampled import sampled
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import INFEASIBLE
-from mechsearch_jax.planner import Problem, graspability_map, update_belief
+from mechsearch_jax.planner import Problem, graspability_map, initial_belief, update_belief
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.retrieval import TargetGrasps, found_grasps, found_hits
 from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.session.preparing import Program, nothing_seen, program
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
 # Of so many of the best candidates the predicted f and g are kept: the chosen one and the runner-up.
@@ -92,6 +93,15 @@ def evidence(moment: Moment, problem: Problem) -> Evidence:
         forecasts=_forecasts(moment, problem),
         tried=moment.tried,
     )
+
+
+def programs(problem: Problem) -> list[Program]:
+    """The programs of `evidence` that take long to compile, but for those of a first decision."""
+    objects = nothing_seen().objects
+    return [
+        program("hits", grasps_at, problem.target_grasps, objects, jnp.zeros(3)),
+        program("g", graspability_map, problem, initial_belief(problem), objects),
+    ]
 
 
 def _forecasts(moment: Moment, problem: Problem) -> Forecasts:

@@ -68,6 +68,7 @@ class Film:
             solids = [*_body_solids(world, played, row), *panda_solids(poses[row], float(played.opening[row]))]
             return eye.picture(solids, empty).pixels
 
+        picture = empty.pixels
         with ThreadPoolExecutor(cores()) as pool:
             for index, rows in itertools.groupby(range(self.count), lambda row: int(played.step[row])):
                 step = recording.steps[index]
@@ -75,7 +76,10 @@ class Film:
                 page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
                 # Small lots, so that pictures do not pile up where drawing is slower.
                 for lot in _in_lots(rows, 2 * cores()):
-                    for row, picture in zip(lot, pool.map(beside, lot), strict=True):
+                    # Of a robot that stands still the same picture is shown again.
+                    drawn = pool.map(beside, [row for row in lot if not played.is_still(row)])
+                    for row in lot:
+                        picture = picture if played.is_still(row) else next(drawn)
                         yield page.image(picture, _moving(step.world, played, row, poses[row]))
 
 

@@ -48,6 +48,11 @@ class Playback(NamedTuple):
     position: Float[np.ndarray, "rows 9 3"]
     rotation: Float[np.ndarray, "rows 9 3 3"]
 
+    def is_still(self, row: int) -> bool:
+        """Whether everything is where it was in the row before, of the same step; the first row has none."""
+        values = (self.step, self.q, self.opening, self.position, self.rotation)
+        return row > 0 and all(np.array_equal(each[row], each[row - 1]) for each in values)
+
 
 class _Piece(NamedTuple):
     """Rows of a step; `time` counts from the beginning of the piece, `ends` is its duration [s]."""

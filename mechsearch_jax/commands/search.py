@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.recording.recording import Recorder, Recording
     from mechsearch_jax.planner import Problem
     from mechsearch_jax.problem.settings import Settings
+    from mechsearch_jax.session.preparing import Preparing
     from mechsearch_jax.workspace.scenario import Scenario
     from mechsearch_jax.workspace.shelf import Shelf
 
@@ -111,36 +112,40 @@ def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrat
 
 
 def _run(
-    status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int, recorded: Problem | None
+    status: Status, preparing: Preparing, chosen: Method, scene: Scenario, problem: Problem, seed: int, records: bool
 ) -> tuple[Episode, Narrator, Recorder]:
-    """Run the episode; return it with its narrator and its recorder, which keeps evidence if `recorded` is given."""
+    """Run the episode; return it with its narrator and its recorder, which keeps evidence if `records`."""
     from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
     from mechsearch_jax.envs.episode.episodes import run_episode
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
-    from mechsearch_jax.session.preparing import first_decision, prepared
+    from mechsearch_jax.session.preparing import decision, retrieval
 
     policy, workcell = chosen.policy(), chosen.workcell
-    first = first_decision(problem, policy, SimulatorConfig().motion)
-    with prepared(first, lambda text: status.console.print(text, style="dim")):
-        # These take long to import; meanwhile the first decision's program is read or compiled.
-        from mechsearch_jax.envs.recording.narration import Narrator
-        from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
-        from mechsearch_jax.envs.simulators.native import NativeSimulator
+    preparing.add(decision(problem, policy))
+    # These take long to import; meanwhile the first decision's program is read or compiled.
+    from mechsearch_jax.envs.episode import verdicts
+    from mechsearch_jax.envs.recording import evidence
+    from mechsearch_jax.envs.recording.narration import Narrator
+    from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
+    from mechsearch_jax.envs.simulators.native import NativeSimulator
 
-        simulator = NativeSimulator(
-            config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
-        )
-        recorder = Recorder(simulator, recorded)
-        narrator = Narrator(status.console, status, problem, recorder.note)
-        settings = RunSettings(
-            recogniser=chosen.recogniser(problem.target),
-            max_steps=chosen.config.max_steps,
-            options=chosen.options(),
-            protocol=chosen.terms,
-            trials=chosen.trials(),
-        )
-        start = Start(scene, seed, mismatch=chosen.mismatch)
-        episode = run_episode(start, problem, policy, simulator, settings, narrator)
+    # Later steps need these, or most searches do.
+    later = [*retrieval(problem, policy), *(evidence.programs(problem) if records else ())]
+    preparing.add([*later, *verdicts.programs(problem)], optional=True)
+    simulator = NativeSimulator(
+        config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
+    )
+    recorder = Recorder(simulator, problem if records else None)
+    narrator = Narrator(status.console, status, problem, recorder.note)
+    settings = RunSettings(
+        recogniser=chosen.recogniser(problem.target),
+        max_steps=chosen.config.max_steps,
+        options=chosen.options(),
+        protocol=chosen.terms,
+        trials=chosen.trials(),
+    )
+    start = Start(scene, seed, mismatch=chosen.mismatch)
+    episode = run_episode(start, problem, policy, simulator, settings, narrator)
     return episode, narrator, recorder
 
 
@@ -169,8 +174,10 @@ def search(
     from rich.console import Console
 
     from mechsearch_jax.envs.episode.episodes import target_of
+    from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
+    from mechsearch_jax.session.preparing import Preparing, motions
 
     if (scenario is None) == (generated.objects is None):
         raise InputError("search: give either a scenario or --objects N, not both")
@@ -188,9 +195,11 @@ def search(
         console.print(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
-        problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
-        recorded = problem if keeps.records else None
-        episode, narrator, recorder = _run(status, chosen, scene, problem, seed, recorded)
+        with Preparing(lambda text: console.print(text, style="dim")) as preparing:
+            # They depend on nothing else, and are compiled while the problem is built.
+            preparing.add(motions(SimulatorConfig().motion))
+            problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
+            episode, narrator, recorder = _run(status, preparing, chosen, scene, problem, seed, keeps.records)
         # Imported late: they take long.
         from mechsearch_jax.envs.recording.narration import verdict
         from mechsearch_jax.envs.recording.recording import NAME, save_recording

@@ -36,7 +36,7 @@ from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import GraspChoice, best_grasp, worth_trying
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import Kept, kept
 from mechsearch_jax.runtime.errors import InputError
 
 
@@ -112,6 +112,11 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective, self.drawn_in)
 
     @property
+    def grasps(self) -> Kept:
+        """Ranks the grasps of a found target: `retrieval.worth_trying` where grasps are tried, else `best_grasp`."""
+        return worth_trying if self.tries else best_grasp
+
+    @property
     def _planning(self) -> PlanningPolicy:
         """The policy with the usual `tries` and `retrieval_contact`, on which a plan does not depend: compiled once."""
         return self.replace(tries=False, config=dataclasses.replace(self.config, retrieval_contact=True))
@@ -162,8 +167,7 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         """
         # Without a traced `found` the call is the same as elsewhere, so that nothing is compiled twice.
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
-        choose_grasp = worth_trying if self.tries else best_grasp
-        grasp = choose_grasp(problem.target_grasps, observation.objects, belief.found_pose, *active)
+        grasp = self.grasps(problem.target_grasps, observation.objects, belief.found_pose, *active)
         return _retrieval(self, belief, observation, grasp)
 
     def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -55,16 +56,32 @@ def program(name: str, function: Any, *args: Any) -> Program:
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))
 
 
-def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> list[Program]:
-    """The programs of the first decision and action that take long to compile, the longest first."""
+def nothing_seen() -> Observation:
+    """An observation of nothing, with the shapes of all others."""
     shapes = jax.eval_shape(lambda: Observation(empty(SLOTS), jax.numpy.array(False), jax.numpy.zeros(3)).judged())
-    seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
-    belief = initial_belief(problem)
+    return jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
+
+
+def decision(problem: Problem, policy: Policy) -> list[Program]:
+    """The programs of the first decision that take long to compile, the longest first."""
+    belief, seen = initial_belief(problem), nothing_seen()
     programs = []
     if isinstance(policy, PlanningPolicy):
         programs.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
-    programs.append(program("belief", update_belief, problem, belief, seen, seen, no_action()))
-    return [*programs, *motions(motion)]
+    return [*programs, program("belief", update_belief, problem, belief, seen, seen, no_action())]
+
+
+def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> list[Program]:
+    """The programs of the first decision and action that take long to compile, the longest first."""
+    return [*decision(problem, policy), *motions(motion)]
+
+
+def retrieval(problem: Problem, policy: Policy) -> list[Program]:
+    """The programs of a decision about a found target that take long to compile, but for the plan."""
+    if not isinstance(policy, PlanningPolicy):
+        return []
+    found_pose = initial_belief(problem).found_pose
+    return [program("grasp", policy.grasps, problem.target_grasps, nothing_seen().objects, found_pose)]
 
 
 def motions(config: MotionConfig) -> list[Program]:
@@ -72,54 +89,106 @@ def motions(config: MotionConfig) -> list[Program]:
     return [program(f"motion of {kind.name}", reference_motion, kind, no_action(), config) for kind in KINDS.values()]
 
 
-@contextlib.contextmanager
-def prepared(programs: Sequence[Program], report: Callable[[str], None]) -> Iterator[None]:
-    """Prepare programs in threads, one per core, while the block runs; a call of one of them waits until it is ready.
+class Preparing:
+    """Prepares programs in threads, one per core, while its block runs; a call of one of them waits until it is ready.
 
     An error in a program is raised when it is called. If the block raises, programs that have not begun are left out.
+    """
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        """Args:
+        report: called with a progress message when programs are added of which some have to be compiled, and after
+          each of these.
+        """
+        self._report = report
+        # Names of what has to be compiled, how many there were, and how many needed programs are not ready.
+        self._missing: list[str] = []
+        self._count = self._awaited = 0
+        self._changed = threading.Condition()
+        self._raised = self._over = False
+        self._queue: queue.SimpleQueue[tuple[Program, bool] | None] = queue.SimpleQueue()
+        # A lowered program must be compiled at once, since a call waits for it: lower only where a core is free.
+        self._free_cores = threading.Semaphore(max(cores(), 2))
+        self._threads = ThreadPoolExecutor(max(cores(), 2))
+
+    def add(self, programs: Sequence[Program], optional: bool = False) -> None:
+        """Prepare programs after those that were added before.
+
+        Args:
+          programs: the longest first.
+          optional: nothing is reported of them; those that have not begun when the block ends are left out, and it does
+            not wait for those that have.
+        """
+        if not optional:
+            missing = [program.name for program in programs if not program.is_ready()]
+            with self._changed:
+                self._missing += missing
+                self._count += len(missing)
+                self._awaited += len(programs)
+                if missing:
+                    self._report_progress()
+        for program in programs:
+            self._queue.put((program, optional))
+
+    def __enter__(self) -> Preparing:
+        threading.Thread(target=self._lower_all).start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
+        self._over, self._raised = True, kind is not None
+        self._queue.put(None)
+        with self._changed:
+            self._changed.wait_for(lambda: self._awaited == 0)
+
+    def _lower_all(self) -> None:
+        while (item := self._queue.get()) is not None:
+            program, optional = item
+            self._free_cores.acquire()
+            finish = None
+            if not (self._raised or (optional and self._over)):
+                with contextlib.suppress(Exception):
+                    finish = program.begin()
+            ended = functools.partial(self._ended, None if optional else program.name)
+            try:
+                compiled = None if finish is None else self._threads.submit(finish)
+            except RuntimeError:
+                # The interpreter ends meanwhile.
+                compiled = None
+            if compiled is None:
+                ended(None)
+            else:
+                compiled.add_done_callback(ended)
+        # Not before: whatever has been lowered has to be compiled, for a call of it would wait for ever.
+        self._threads.shutdown(wait=False)
+
+    def _ended(self, name: str | None, compiled: Future[None] | None) -> None:
+        """Note that a program is ready, was not compiled (None) or failed; the name of an optional one is None."""
+        self._free_cores.release()
+        with self._changed:
+            if name is None:
+                return
+            if name in self._missing and compiled is not None and compiled.exception() is None:
+                self._missing.remove(name)
+                self._report_progress()
+            self._awaited -= 1
+            self._changed.notify()
+
+    def _report_progress(self) -> None:
+        left = f": {', '.join(dict.fromkeys(self._missing))}" if self._missing else ""
+        self._report(f"compiling{left}; {self._count - len(self._missing)} of {self._count} done")
+
+
+@contextlib.contextmanager
+def prepared(programs: Sequence[Program], report: Callable[[str], None]) -> Iterator[None]:
+    """Prepare programs while the block runs; see `Preparing`.
 
     Args:
       programs: the longest first.
-      report: called with a progress message at the beginning, if there is anything to compile, and after each program.
+      report: see `Preparing`.
     """
-    missing = [program.name for program in programs if not program.is_ready()]
-    count, lock, ended = len(missing), threading.Lock(), threading.Event()
-    # A lowered program must be compiled at once, since a call waits for it: lower only where a core is free.
-    free_cores = threading.Semaphore(max(cores(), 2))
-
-    def report_progress() -> None:
-        left = f": {', '.join(dict.fromkeys(missing))}" if missing else ""
-        report(f"compiling{left}; {count - len(missing)} of {count} done")
-
-    def on_compiled(name: str, future: Future[None]) -> None:
-        free_cores.release()
-        with lock:
-            if name in missing and future.exception() is None:
-                missing.remove(name)
-                report_progress()
-
-    def lower_all() -> None:
-        for program in programs:
-            free_cores.acquire()
-            finish = None
-            if not ended.is_set():
-                with contextlib.suppress(Exception):
-                    finish = program.begin()
-            if finish is None:
-                free_cores.release()
-            else:
-                threads.submit(finish).add_done_callback(functools.partial(on_compiled, program.name))
-
-    if missing:
-        report_progress()
-    with ThreadPoolExecutor(len(programs) + 1) as threads:
-        lowering = threads.submit(lower_all)
-        try:
-            yield
-        except BaseException:
-            ended.set()
-            raise
-        lowering.result()
+    with Preparing(report) as preparing:
+        preparing.add(programs)
+        yield
 
 
 def prepare(programs: Sequence[Program], report: Callable[[str], None]) -> None:
