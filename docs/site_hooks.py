@@ -2,7 +2,7 @@
 
 A page links files of the repository that lie outside of docs, such as stored results. On the site they lie under
 `files`, copied as they are, and a folder becomes a list of what is in it. Two pages from elsewhere become pages of the
-site.
+site; notebooks do so by `site_notebooks`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _on_site(path):
     if path in PLACES:
         return PLACES[path]
     if path.startswith("docs/"):
-        return path.removeprefix("docs/")
+        return re.sub(r"\.ipynb$", ".md", path.removeprefix("docs/"))
     return f"files/{path}.md" if (ROOT / path).is_dir() else f"files/{path}"
 
 

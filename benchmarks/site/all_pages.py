@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.report import reproduction_page, results_page
 from mechsearch_jax.benchmarks.running import episode_seconds
-from mechsearch_jax.benchmarks.site import set_pages
+from mechsearch_jax.benchmarks.site import network_pages, set_pages
 from mechsearch_jax.benchmarks.studies import costs_page
 from mechsearch_jax.benchmarks.studies import page as studies_page
 
@@ -19,6 +19,7 @@ PAGES: dict[str, Callable[[Sequence[str]], None]] = {
     "docs/results.md": results_page.main,
     "docs/costs.md": costs_page.main,
     "docs/scene-sets": set_pages.main,
+    "docs/networks": network_pages.main,
 }
 
 

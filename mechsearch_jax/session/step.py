@@ -64,13 +64,13 @@ class SearchStep:
         return step_json(self)
 
     @functools.cached_property
-    def picture(self) -> Figure:
-        """The image, f and g from above, and the action."""
+    def frame(self) -> Frame:
+        """The step as `viz.filmstrip.filmstrip` draws it, alone or beside others."""
         objects, after = (jax.tree.map(np.asarray, s) for s in (self.observation.objects, self.decision.predicted))
         action, found = self.decision.action, bool(self.belief.found)
         kind, moves = kind_of(int(action.kind)), self.trajectory is not None
         possible = np.asarray(self.belief.exists)
-        frame = Frame(
+        return Frame(
             title=f"{self.index + 1}  {kind.describe(action, objects.capacity) if moves else 'nothing to be done'}",
             caption=self.reason,
             image=self.image,
@@ -83,8 +83,12 @@ class SearchStep:
             after=after,
             sketch=kind.sketch(objects, after, action) if moves else Sketch(),
         )
+
+    @functools.cached_property
+    def picture(self) -> Figure:
+        """The image, f and g from above, and the action."""
         heading = "; ".join(self.warnings) or "What the robot sees, and what it is to do"
-        return filmstrip([frame], self.problem.camera, self.problem.shelf, self.problem.target, heading)
+        return filmstrip([self.frame], self.problem.camera, self.problem.shelf, self.problem.target, heading)
 
 
 class Motion(NamedTuple):
