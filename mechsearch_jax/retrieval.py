@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
 from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.bodies import enlarged, slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -299,11 +300,10 @@ def _ranked(
     found = found_grasps(grasps, T_world_target, active)
 
     def near(clearance):
-        return jnp.sum(straight_hits(tables, found, scene.replace(size=scene.size + clearance), active), axis=1)
+        return jnp.sum(straight_hits(tables, found, enlarged(scene, clearance), active), axis=1)
 
     def hit(depth):
-        slim = scene.replace(size=jnp.maximum(scene.size - depth, 0.25 * scene.size))
-        return jnp.sum(found_hits(grasps, found, slim, active), axis=1)
+        return jnp.sum(found_hits(grasps, found, slimmed(scene, depth, 0.25), active), axis=1)
 
     all_hits, *deeper = jax.lax.map(hit, jnp.float32((0.0, *depths)))
     hits = jnp.where(found.feasible, all_hits, INFEASIBLE)

@@ -237,10 +237,8 @@ def recover_scene(
     shapes = [recover(segment, config) if len(segment) >= LEAST_POINTS else None for segment in segments]
     absent = Recovered(np.full(3, 1e-3), np.ones(2), np.zeros(3), np.eye(3), np.inf, 0)
     filled = [shape or absent for shape in shapes]
-    return Superquadrics(
-        **{
-            field: jnp.asarray(np.stack([getattr(shape, field) for shape in filled]), jnp.float32)
-            for field in ("size", "exponents", "position", "rotation")
-        },
-        valid=jnp.array([shape is not None for shape in shapes]),
+    size, exponents, position, rotation = (
+        jnp.asarray(np.stack([getattr(shape, field) for shape in filled]), jnp.float32)
+        for field in ("size", "exponents", "position", "rotation")
     )
+    return Superquadrics(size, exponents, position, rotation, valid=jnp.array([shape is not None for shape in shapes]))

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
-from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import surfaces
 from mechsearch_jax.geometry.collision import Clouds, clouds_of
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -26,8 +26,8 @@ SWEPT_PLACES = 7
 
 
 def object_clouds(scene: Superquadrics, count: int) -> Float[Array, "n 3 p"]:
-    """Surface points of every object in its own frame, as rows of coordinates [m]."""
-    return jnp.swapaxes(superquadric.sample_surface(scene.size, scene.exponents, count), -1, -2)
+    """Points on the surfaces of every object's parts in its own frame, as rows of coordinates [m]."""
+    return jnp.swapaxes(surfaces(scene, count), -1, -2)
 
 
 def swept_places(T_world_object, direction, distance, steps=SWEPT_PLACES):

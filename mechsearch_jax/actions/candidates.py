@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.approach import cloud_index, gripper_clouds
 from mechsearch_jax.actions.config import ActionSpace
@@ -14,7 +15,8 @@ from mechsearch_jax.actions.kind import SampledKind
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Candidates
 from mechsearch_jax.actions.unseen_space import PossibleSpace
-from mechsearch_jax.geometry.collision import collisions
+from mechsearch_jax.geometry.bodies import part_at, world_parts
+from mechsearch_jax.geometry.collision import Clouds, collisions
 from mechsearch_jax.geometry.footprints import footprints
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.entry import WaysIn, gripper_enters
@@ -75,6 +77,9 @@ def all_candidates(
     reached, against = [], []
     for kind, before, T, part in zip(SAMPLED_KINDS, previous, proposed.T_world_gripper, proposed.parts, strict=True):
         travels = kind.travels(space, T_world_gripper[part], near[part]).reshape(*T.shape[:2], -1)
+        if kind.surrounds_object and scene.parts is not None:
+            tested = jnp.any(travels & fresh[:, None, None], axis=-1)
+            travels &= ~_meets_own_parts(scene, clouds, cloud[part], T, tested)[..., None]
         reached.append(jnp.where(fresh[:, None, None], travels, before.reached))
         obstacles = tested_pairs & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else tested_pairs
         owner = np.repeat(np.arange(n), T.shape[1])
@@ -93,6 +98,32 @@ def all_candidates(
         usable = candidates.replace(reached=reached[i] & able[i][:, None, None])
         tested.append(candidates.replace(enters=kind.entering(space, scene, possible, usable)))
     return tuple(tested)
+
+
+def _meets_own_parts(
+    scene: Superquadrics,
+    clouds: Clouds,
+    cloud: Int[Array | np.ndarray, " k"],
+    T: Float[Array, "n v 4 4"],
+    tested: Bool[Array, "n v"],
+) -> Bool[Array, "n v"]:
+    """Which grasps of bodies hit a part of the same body, other than the one between the fingers.
+
+    Args:
+      scene: the bodies, with parts.
+      clouds: that the gripper sweeps, and `cloud`, their indices for the K = N V grasps.
+      cloud: see `clouds`.
+      T: poses of the gripper.
+      tested: which of them are tested; the result is False for the others.
+    """
+    (n, v), shapes = tested.shape, world_parts(scene)
+    owner, T = np.repeat(np.arange(n), v), T.reshape(-1, 4, 4)
+    held = jax.vmap(lambda i, point: part_at(scene, i, point))(jnp.asarray(owner), T[:, :3, 3])
+    p = shapes.capacity // n
+    part = np.arange(n * p)
+    mask = (part[None] // p == owner[:, None]) & (part[None] % p != held[:, None]) & shapes.valid[None]
+    hits = collisions(clouds, cloud, T, shapes, mask & tested.reshape(-1, 1))
+    return jnp.any(hits, axis=1).reshape(n, v)
 
 
 class _Proposed(NamedTuple):

@@ -14,7 +14,7 @@ from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
 from mechsearch_jax.actions.types import DrawnCandidate, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, touch_probability
-from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import surface_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 
@@ -118,8 +118,7 @@ def contact_probability(
         return jnp.float32(0.0)
     action = sample.action
     opening = jnp.select([action.kind == kind.code for kind in SAMPLED_KINDS], [k.opening for k in SAMPLED_KINDS])
-    size, exponents = scene.size[action.object], scene.exponents[action.object]
-    body = superquadric.sample_surface(size, exponents, space.config.object_points)
+    body = surface_of(scene, action.object, space.config.object_points)
     gripper = space.tables.clouds[opening, sample.wrist].T
     swept = jnp.concatenate(
         [transform(sample.grippers[:, None], gripper[None]), transform(sample.bodies[:, None], body[None])], axis=1

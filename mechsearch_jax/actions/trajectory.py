@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.bodies import grasped_shape
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
@@ -113,6 +114,11 @@ def grip_for(problem: Setting, observation: Observation | None, action: Action) 
         return grip_of_anything(opening)
     what = grasped(problem, observation, action)
     closing = np.asarray(action.T_world_gripper, float)[:3, 1]
+    objects, i = observation.objects, int(action.object)
+    if kind.holds_object and i < objects.capacity and objects.parts is not None:
+        shape = grasped_shape(objects, jnp.int32(i), jnp.asarray(action.T_world_gripper)[:3, 3])
+        rotation, size, exponents = (np.asarray(a) for a in (shape.rotation, shape.size, shape.exponents))
+        return grip_of(closing, rotation, size, exponents, opening)
     if what.seen:
         return grip_of(closing, what.T_world_object[:3, :3], np.array(what.size), np.array(what.exponents), opening)
     x, y, _ = what.size

@@ -11,6 +11,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
 from mechsearch_jax.belief.unseen_motion import reopened
 from mechsearch_jax.existence import allowances, closer_image, existence, object_views, plainly_elsewhere
+from mechsearch_jax.geometry.bodies import with_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import grasp_hits, graspability, pairs
@@ -166,6 +167,8 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
         rotation=T[:3, :3],
         valid=belief.found,
     )
+    if objects.parts is not None:
+        target = with_parts(target, objects.parts.capacity)
     everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), objects, target)
     return everything, jnp.arange(everything.capacity) == objects.capacity
 

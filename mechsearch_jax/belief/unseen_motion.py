@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.approach import object_clouds
 from mechsearch_jax.actions.config import CLOSED, OPEN
 from mechsearch_jax.actions.registry import KINDS, ActionKind
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.bodies import surfaces
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.problem.problem import Problem
@@ -159,9 +159,9 @@ def _bodies(
 ) -> tuple[Float[Array, "n p 3"], Float[Array, "n p 3"]]:
     """Points of the objects before the action, and at the poses of their matches after it [m]."""
     size = jnp.where(before.valid[:, None], before.size, 1.0)
-    clouds = jnp.swapaxes(object_clouds(before.replace(size=size), problem.config.actions.object_points), -1, -2)
-    start = transform(make(before.rotation, before.position)[:, None], clouds)
-    return start, transform(make(after.rotation[same], after.position[same])[:, None], clouds)
+    points = surfaces(before.replace(size=size), problem.config.actions.object_points)
+    start = transform(make(before.rotation, before.position)[:, None], points)
+    return start, transform(make(after.rotation[same], after.position[same])[:, None], points)
 
 
 def same_objects(

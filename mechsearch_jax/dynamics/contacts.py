@@ -1,4 +1,7 @@
-"""Contacts of footprints with the gripper, with walls and with each other."""
+"""Contacts of footprints with the gripper, with walls and with each other.
+
+Bodies of several parts touch with the footprints of these, and each contact is that of the part that is in it deepest.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.geometry.footprints import Footprints, dot, turned
+from mechsearch_jax.geometry.footprints import Footprints, dot, in_world, turned
 from mechsearch_jax.workspace.shelf import Shelf
 
 BOUNDARY_POINTS = 24
@@ -48,6 +51,34 @@ def outline_points(prints):
     return turned(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
 
 
+def of_bodies(prints, depth, *vectors):
+    """The deepest of the contacts of each body's parts: its depth (..., N), and vectors (..., N, 2)."""
+    if prints.parts is None:
+        return depth, *vectors
+    shape = (*depth.shape[:-1], *prints.parts.valid.shape)
+    depth, vectors = depth.reshape(shape), [v.reshape(*shape, 2) for v in vectors]
+    i = jnp.argmax(depth, axis=-1)[..., None]
+    chosen = (jnp.take_along_axis(v, i[..., None], axis=-2)[..., 0, :] for v in vectors)
+    return jnp.take_along_axis(depth, i, axis=-1)[..., 0], *chosen
+
+
+def from_centres(prints, arm):
+    """Vectors (..., N P, 2) from the centres of parts as vectors from the centres of their bodies."""
+    if prints.parts is None:
+        return arm
+    offset = turned(prints.yaw[:, None], prints.parts.position).reshape(-1, 2)
+    return arm + offset.reshape(*[1] * (arm.ndim - 2), -1, 2)
+
+
+def pusher_contacts(prints, points):
+    """Of each footprint with the gripper's points: the depth, the direction in which it gives way, and the place of the
+    contact from its centre."""
+    shapes = in_world(prints)
+    depth, point = deepest(*pusher_depth(shapes, points))
+    away = -turned(shapes.yaw, point_normal(shapes.half, shapes.round, point))
+    return of_bodies(prints, depth, away, from_centres(prints, turned(shapes.yaw, point)))
+
+
 def pusher_depth(prints, points):
     """Depth of the gripper's points in each footprint, -1 at other heights, and their positions in its frame."""
     local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
@@ -57,7 +88,25 @@ def pusher_depth(prints, points):
 
 
 def pair_contacts(prints):
-    """For every ordered pair (i, j): the deepest contact, and the direction in which j has to give way."""
+    """For every ordered pair (i, j): the deepest contact, the direction in which j has to give way, and the place from
+    its centre."""
+    if prints.parts is None:
+        return _pair_contacts(prints, ~jnp.eye(prints.valid.size, dtype=bool))
+    shapes, (n, p) = in_world(prints), prints.parts.valid.shape
+    other = jnp.repeat(jnp.repeat(~jnp.eye(n, dtype=bool), p, axis=0), p, axis=1)
+    # Parts may pass above each other.
+    level = jnp.maximum(shapes.low[:, None], shapes.low[None]) < jnp.minimum(shapes.high[:, None], shapes.high[None])
+    depth, direction, arm = _pair_contacts(shapes, other & level)
+    depth, direction, arm = of_bodies(prints, depth, direction, from_centres(prints, arm))
+    # The deepest of the parts of i with each j.
+    i = jnp.argmax(depth.reshape(n, p, n), axis=1)
+    rows = i + p * jnp.arange(n)[:, None]
+    columns = jnp.arange(n)[None]
+    return depth[rows, columns], direction[rows, columns], arm[rows, columns]
+
+
+def _pair_contacts(prints, other):
+    """`pair_contacts` of single shapes, where `other` says which pairs can touch."""
     outline = outline_points(prints)
     into_j = turned(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
     depth, point = deepest(point_depth(prints.half[None, :, None, :], prints.round[None, :, None], into_j), into_j)
@@ -70,15 +119,23 @@ def pair_contacts(prints):
     other_arm = jnp.swapaxes(world, 0, 1) - prints.position[None, :, :]
     swap = depth < depth.T
     deeper = jnp.where(swap[..., None], other_direction, direction), jnp.where(swap[..., None], other_arm, arm)
-    both = prints.valid[:, None] & prints.valid[None, :] & ~jnp.eye(prints.valid.size, dtype=bool)
+    both = prints.valid[:, None] & prints.valid[None, :] & other
     return jnp.where(both, jnp.maximum(depth, depth.T), -1.0), *deeper
 
 
 def wall_depth(shelf, prints):
-    """How deep outlines are in the back, right and left walls, shape (N, BOUNDARY_POINTS, 3) [m]; and the outlines."""
-    outline = outline_points(prints)
+    """How deep outlines are in the back, right and left walls, shape (N, B, 3) [m]; and the outlines, (N, B, 2).
+
+    B is `BOUNDARY_POINTS` for each part.
+    """
+    shapes = in_world(prints)
+    outline = outline_points(shapes)
     x, y = outline[..., 0], outline[..., 1]
-    return jnp.stack([x - shelf.back, shelf.right - y, y - shelf.left], axis=-1), outline
+    depth = jnp.stack([x - shelf.back, shelf.right - y, y - shelf.left], axis=-1)
+    if prints.parts is None:
+        return depth, outline
+    n = prints.valid.size
+    return jnp.where(shapes.valid[:, None, None], depth, -1.0).reshape(n, -1, 3), outline.reshape(n, -1, 2)
 
 
 def unresolved(shelf: Shelf, before: Footprints, after: Footprints, points: Float[Array, "p 3"]) -> Float[Array, ""]:
@@ -89,7 +146,7 @@ def unresolved(shelf: Shelf, before: Footprints, after: Footprints, points: Floa
       before, after: the objects.
       points: surface of the gripper where the push ends, in the world [m].
     """
-    held = jnp.max(pusher_depth(after, points)[0])
+    held = jnp.max(pusher_depth(in_world(after), points)[0])
     jammed = jnp.max(pair_contacts(after)[0]) - jnp.maximum(jnp.max(pair_contacts(before)[0]), 0.0)
     wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(wall_depth(shelf, after)[0], axis=1), -1.0))
     return jnp.maximum(jnp.maximum(jnp.maximum(held, jammed), wall), 0.0)

@@ -99,7 +99,11 @@ def predicted(
     displacement: Array,
     q7: Array,
 ) -> PushOutcome:
-    """A network's prediction of a push; see `LearnedPush` and `push_model.PushModel` for the arguments."""
+    """A network's prediction of a push; see `LearnedPush` and `push_model.PushModel` for the arguments.
+
+    An approximation: to the network a body of several parts is the superquadric that bounds it. Overlaps afterwards are
+    those of its parts.
+    """
     start = push_start(shelf, scene, pusher, T_world_gripper, displacement)
     output = apply_network(network, parameters, start)
     moves = scene.valid & (jax.nn.sigmoid(output.moves) > likely)

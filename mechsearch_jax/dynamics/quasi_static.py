@@ -12,14 +12,14 @@ from mechsearch_jax.dynamics.contacts import (
     deepest,
     pair_contacts,
     point_depth,
-    point_normal,
+    pusher_contacts,
     pusher_depth,
     unresolved,
     wall_depth,
 )
 from mechsearch_jax.dynamics.push_model import LEVERAGE, LOW_CONTACT, PushOutcome
 from mechsearch_jax.dynamics.rigid import rigid_motion
-from mechsearch_jax.geometry.footprints import TOUCH, dot, extents, footprints, turned
+from mechsearch_jax.geometry.footprints import TOUCH, dot, extents, footprints, in_world, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 from mechsearch_jax.runtime.errors import InputError
@@ -53,18 +53,20 @@ def _yield_to(prints, depth, normal, arm, heading, friction):
 
 
 def _resolve_pusher(prints, points, heading, friction):
-    depth, point = deepest(*pusher_depth(prints, points))
-    away = -turned(prints.yaw, point_normal(prints.half, prints.round, point))
+    depth, away, arm = pusher_contacts(prints, points)
     heading = jnp.broadcast_to(heading, away.shape)
-    return _yield_to(prints, depth, away, turned(prints.yaw, point), heading, friction)
+    return _yield_to(prints, depth, away, arm, heading, friction)
 
 
 def _touched_high(scene, prints, points, heading, leverage):
     """Which objects are touched so high above the board that a push along `heading` topples them."""
-    local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
-    depth = point_depth(prints.half[:, None, :], prints.round[:, None], local)
-    level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
-    touching = level & (depth > -TOUCH) & prints.valid[:, None]
+    shapes = in_world(prints)
+    local = turned(-shapes.yaw[:, None], points[None, :, :2] - shapes.position[:, None, :])
+    depth = point_depth(shapes.half[:, None, :], shapes.round[:, None], local)
+    level = (points[None, :, 2] > shapes.low[:, None]) & (points[None, :, 2] < shapes.high[:, None])
+    touching = level & (depth > -TOUCH) & shapes.valid[:, None]
+    if prints.parts is not None:
+        touching = jnp.any(touching.reshape(*prints.parts.valid.shape, -1), axis=1)
     lowest = jnp.min(jnp.where(touching, points[None, :, 2], jnp.inf), axis=1) - prints.low
     half = extents(scene, jnp.append(heading, 0.0)[:, None])[:, 0]
     limit = jnp.where(prints.round, leverage[1], leverage[0]) * half
@@ -142,7 +144,7 @@ class QuasiStatic:
         points = start[None] + fraction[:, None, None] * displacement[None, None]
         after, stages = jax.lax.scan(step, before, points)
         # The gripper would pass through a jammed object, so the deepest penetration of all steps counts.
-        held = jnp.max(jax.vmap(pusher_depth)(stages, points)[0])
+        held = jnp.max(jax.vmap(pusher_depth)(jax.vmap(in_world)(stages), points)[0])
         residual = jnp.maximum(held, unresolved(shelf, before, after, points[-1]))
         turn = after.yaw - before.yaw
         moved = (jnp.abs(turn) > 1e-3) | (jnp.max(jnp.abs(after.position - before.position), axis=-1) > 1e-4)

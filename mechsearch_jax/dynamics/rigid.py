@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mechsearch_jax.geometry.bodies import grasped_shape
 from mechsearch_jax.geometry.footprints import QUARTER_TURN, headings, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, matmul, transform, yaw_rotation
+from mechsearch_jax.geometry.transforms import compose, inverse, matmul, rotate, transform, yaw_rotation
 
 
 def rigid_motion(
@@ -25,13 +26,30 @@ def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Ar
     """`R_world_object` of an object once the fingers have closed on it.
 
     An approximation: an object with flat sides turns about its vertical axis until the nearest side lies flat against
-    a finger, and does not shift; a round object stays as it is.
+    a finger, and does not shift; a round object stays as it is. Of a body of several parts it is the grasped one that
+    turns about its centre or stays, and takes the others with it: see `held_position`.
     """
     rotation = scene.rotation[index]
-    now = headings(rotation, scene.exponents[index])
+    if scene.parts is None:
+        now = headings(rotation, scene.exponents[index])
+    else:
+        shape = grasped_shape(scene, index, T_world_grasp[:3, 3])
+        now = headings(shape.rotation, shape.exponents)
     skew = jnp.arctan2(T_world_grasp[1, 2], T_world_grasp[0, 2]) - now.yaw
     skew = skew - QUARTER_TURN * jnp.round(skew / QUARTER_TURN)
     return matmul(yaw_rotation(jnp.where(now.round, 0.0, skew)), rotation)
+
+
+def held_position(
+    scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"], held: Float[Array, "3 3"]
+) -> Float[Array, "3"]:
+    """Position of an object, or of a body's frame, once it is turned to `held`, its rotation `in_hand` [m]."""
+    position = scene.position[index]
+    if scene.parts is None:
+        return position
+    middle = grasped_shape(scene, index, T_world_grasp[:3, 3]).position
+    turn = matmul(held, scene.rotation[index].T)
+    return middle + rotate(turn, position - middle)
 
 
 def pick_and_place(
@@ -39,8 +57,9 @@ def pick_and_place(
 ) -> Superquadrics:
     """The scene after an object, turned `in_hand`, has moved with the gripper from one pose to the other."""
     motion = compose(T_world_place, inverse(T_world_grasp))
-    position = transform(motion, scene.position[index])
-    rotation = matmul(motion[:3, :3], in_hand(scene, index, T_world_grasp))
+    held = in_hand(scene, index, T_world_grasp)
+    position = transform(motion, held_position(scene, index, T_world_grasp, held))
+    rotation = matmul(motion[:3, :3], held)
     return scene.replace(
         position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
     )

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.existence.config import ExistenceConfig
 from mechsearch_jax.existence.function import in_window, shown_pixels
 from mechsearch_jax.existence.tables import ExistenceTables
-from mechsearch_jax.existence.views import ObjectViews, without_unseen
+from mechsearch_jax.existence.views import ObjectViews, object_windows
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import enlarged, slimmed, world_parts
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, transform
@@ -114,12 +115,7 @@ def closer_image(
     if scale == step:
         return render.merge_windows(closer, views.windows)
     window = math.ceil(config.window[0] * grown), math.ceil(config.window[1] * grown)
-    scene = scene.replace(size=scene.size + ROUNDED)
-
-    def view(closer, _, body):
-        return render.object_window(closer, body, window)
-
-    windows = without_unseen(masked_vmap(view, scene.valid, closer, None, scene, block=1), scene.valid)
+    windows = object_windows(closer, enlarged(scene, ROUNDED), scene.valid, window, block=1)
     return render.merge_windows(closer, windows)
 
 
@@ -181,12 +177,12 @@ def plainly_elsewhere(
       config: static.
     """
     shows = _pixels(tables, camera, target, closer, T_world_target, config, NEARER)
-    slim = jnp.maximum(scene.size - TOUCHING, 0.25 * scene.size)
+    slim = world_parts(slimmed(scene, TOUCHING, 0.25))
     points = transform(T_world_target, tables.cloud.T)
 
     def reaches(size, exponents, position, rotation):
         local = transform(inverse(make(rotation, position)), points)
         return jnp.any(superquadric.gauge(size, exponents, local) < 1.0)
 
-    inside = jax.vmap(reaches)(slim, scene.exponents, scene.position, scene.rotation) & scene.valid
+    inside = jax.vmap(reaches)(slim.size, slim.exponents, slim.position, slim.rotation) & slim.valid
     return (shows > PLAIN * found_pixels(camera, config.found_pixels)) | jnp.any(inside)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool
 
 from mechsearch_jax.existence.config import ExistenceConfig
 from mechsearch_jax.existence.tables import ExistenceTables
+from mechsearch_jax.geometry.bodies import per_part, world_parts
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -74,10 +75,7 @@ def object_views(
     coarse = camera.scaled(config.step(camera))
     fresh = scene.valid if moved is None else moved & scene.valid
 
-    def view(coarse, _, body):
-        return render.object_window(coarse, body, config.window)
-
-    windows = without_unseen(masked_vmap(view, fresh, coarse, None, scene, block=8), fresh)
+    windows = object_windows(coarse, scene, fresh, config.window, block=8)
     collides = None if exists is None else _collisions(tables, scene, exists, fresh)
     if previous is None or moved is None:
         return ObjectViews(windows, collides)
@@ -91,7 +89,48 @@ def object_views(
     )
 
 
-def without_unseen(windows: render.Window, mask: Bool[Array, " n"]) -> render.Window:
+def object_windows(
+    camera: Camera, scene: Superquadrics, mask: Bool[Array, " n"], window: tuple[int, int], block: int
+) -> render.Window:
+    """The images of the masked objects; the others' show nothing.
+
+    Args:
+      camera: the camera at the windows' resolution.
+      scene: the objects, fields (N, ...).
+      mask: which of them are rendered.
+      window: rows and columns; static.
+      block: number rendered at once on a CPU; static.
+    """
+    if scene.parts is not None:
+        return _windows_of_parts(camera, scene, mask, window, block)
+
+    def view(camera, _, body):
+        return render.object_window(camera, body, window)
+
+    return _without_unseen(masked_vmap(view, mask, camera, None, scene, block=block), mask)
+
+
+def _windows_of_parts(
+    camera: Camera, scene: Superquadrics, mask: Bool[Array, " n"], window: tuple[int, int], block: int
+) -> render.Window:
+    """`object_windows` of bodies with parts: absent parts cost nothing, and a depth is the least of the parts."""
+
+    def view(camera, _, row):
+        body, part = row
+        return render.object_window(camera, body, window, part)
+
+    parts = world_parts(scene)
+    owners = jax.tree.map(lambda a: jnp.repeat(a, parts.capacity // scene.capacity, axis=0), scene.replace(parts=None))
+    drawn = per_part(scene, mask) & parts.valid
+    windows = _without_unseen(masked_vmap(view, drawn, camera, None, (owners, parts), block=block), drawn)
+    windows = jax.tree.map(lambda a: a.reshape(scene.capacity, -1, *a.shape[1:]), windows)
+    # All parts of a body have the same window, but where they are absent.
+    first = jnp.argmax(drawn.reshape(scene.capacity, -1), axis=1)
+    one = jax.tree.map(lambda a: a[jnp.arange(scene.capacity), first], windows)
+    return one.replace(depth=jnp.min(windows.depth, axis=1))
+
+
+def _without_unseen(windows: render.Window, mask: Bool[Array, " n"]) -> render.Window:
     """The windows; those outside of the mask show nothing."""
     return windows.replace(
         depth=jnp.where(mask[:, None, None], windows.depth, jnp.inf), stride=jnp.maximum(windows.stride, 1)

@@ -21,6 +21,7 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int, Integer, UInt8
 
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import any_part, per_part, world_parts
 from mechsearch_jax.geometry.collision_kernel import collide, uses_kernel
 from mechsearch_jax.geometry.masked import block_size, entry_of, for_each, merged, put, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -70,7 +71,7 @@ def collisions(
     mask: Bool[Array, "m n"],
     own: bool = False,
 ) -> Bool[Array, "m n"]:
-    """Which placed clouds collide with which objects.
+    """Which placed clouds collide with which objects: hits of a body are hits of any of its parts.
 
     Args:
       clouds: C point clouds.
@@ -83,12 +84,19 @@ def collisions(
     Returns:
       True where a masked pair collides.
     """
-    T_object_world = inverse(make(scene.rotation, scene.position))[:, :3].reshape(-1, 12)
-    objects = jnp.concatenate([T_object_world, scene.size, scene.exponents], axis=1)
+    parts = world_parts(scene)
+    T_object_world = inverse(make(parts.rotation, parts.position))[:, :3].reshape(-1, 12)
+    objects = jnp.concatenate([T_object_world, parts.size, parts.exponents], axis=1)
     boxes = jnp.stack([clouds.low, clouds.high], axis=1)
     table = (clouds.points, boxes, clouds.gap)
     rows = (jnp.asarray(cloud, jnp.uint32), T_world_cloud, objects, table[:2] if own else None)
-    return merged(functools.partial(_collide, clouds.first))(mask, None if own else table, rows)
+    hits = merged(functools.partial(_collide, clouds.first))(_of_parts(scene, mask), None if own else table, rows)
+    return any_part(scene, hits)
+
+
+def _of_parts(scene: Superquadrics, mask: Bool[Array, "m n"]) -> Bool[Array, "m parts"]:
+    """The mask of `world_parts`, without those that are absent."""
+    return mask if scene.parts is None else per_part(scene, mask) & scene.parts.valid.reshape(1, -1)
 
 
 def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple) -> Array:

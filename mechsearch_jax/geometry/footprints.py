@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 
 ROUND_EXPONENT = 0.6
@@ -23,7 +24,18 @@ TOUCH = 0.004
 
 
 class Footprints(flax.struct.PyTreeNode):
-    """Objects seen from above: a rectangle or an ellipse and a range of heights, every field with leading axis N."""
+    """Objects seen from above: a rectangle or an ellipse and a range of heights, every field with leading axis N.
+
+    Attributes:
+      half: half-extents along its own axes [m], shape (N, 2).
+      round: whether it is an ellipse, shape (N,).
+      position: of its centre [m], shape (N, 2).
+      yaw: of its first axis [rad], shape (N,).
+      low, high: of its heights [m], shape (N,).
+      valid: whether the slot holds an object, shape (N,).
+      parts: footprints of the parts of each body, placed in its own footprint's axes, fields (N, P, ...); None if every
+        body is a single superquadric. See `in_world`.
+    """
 
     half: jax.Array
     round: jax.Array
@@ -32,6 +44,7 @@ class Footprints(flax.struct.PyTreeNode):
     low: jax.Array
     high: jax.Array
     valid: jax.Array
+    parts: Footprints | None = None
 
 
 def footprints(scene: Superquadrics) -> Footprints:
@@ -39,6 +52,38 @@ def footprints(scene: Superquadrics) -> Footprints:
 
     An approximation: exponents e2 above 0.6 about a vertical axis count as round, everything else as a rectangle.
     """
+    whole = _footprints(scene)
+    if scene.parts is None:
+        return whole
+    parts = jax.tree.map(lambda a: a.reshape(scene.capacity, -1, *a.shape[1:]), _footprints(world_parts(scene)))
+    low, high = (
+        sign * jnp.min(jnp.where(parts.valid, sign * side, jnp.inf), axis=1)
+        for sign, side in ((1.0, parts.low), (-1.0, parts.high))
+    )
+    return whole.replace(
+        low=jnp.where(whole.valid, low, whole.low),
+        high=jnp.where(whole.valid, high, whole.high),
+        parts=parts.replace(
+            position=turned(-whole.yaw[:, None], parts.position - whole.position[:, None]),
+            yaw=parts.yaw - whole.yaw[:, None],
+        ),
+    )
+
+
+def in_world(prints: Footprints) -> Footprints:
+    """The footprints of all parts in the world, fields (N P, ...), in the order of `bodies.world_parts`."""
+    if prints.parts is None:
+        return prints
+    parts = prints.parts
+    placed = parts.replace(
+        position=turned(prints.yaw[:, None], parts.position) + prints.position[:, None],
+        yaw=parts.yaw + prints.yaw[:, None],
+    )
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), placed)
+
+
+def _footprints(scene: Superquadrics) -> Footprints:
+    """`footprints` of superquadrics, and of those that bound bodies."""
     heading = headings(scene.rotation, scene.exponents)
     c, s, zero = jnp.cos(heading.yaw), jnp.sin(heading.yaw), jnp.zeros_like(heading.yaw)
     # Along its yaw, across it, and upwards.

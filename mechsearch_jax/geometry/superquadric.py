@@ -28,12 +28,16 @@ EDGE_EXPONENT = 0.2
 class Superquadrics(flax.struct.PyTreeNode):
     """N superquadrics, of which any may be absent; every field has the leading axes `(..., N)`.
 
+    With `parts` they are N rigid bodies, each the union of its parts; `bodies` has the functions for both cases.
+
     Attributes:
       size: half-extents along the object's axes [m], shape (..., N, 3).
       exponents: (e1, e2), shape (..., N, 2); (0.2, 0.2) is a box, (0.2, 1.0) a cylinder.
       position: `t_world_object` [m], shape (..., N, 3).
       rotation: `R_world_object`, shape (..., N, 3, 3).
       valid: whether the slot holds an object, shape (..., N).
+      parts: the parts of each body, in its frame, fields (..., N, P, ...); its other fields are then those of the
+        superquadric that bounds them. None if every body is a single superquadric.
     """
 
     size: jax.Array
@@ -41,21 +45,25 @@ class Superquadrics(flax.struct.PyTreeNode):
     position: jax.Array
     rotation: jax.Array
     valid: jax.Array
+    parts: Superquadrics | None = None
 
     @property
     def capacity(self) -> int:
         return self.size.shape[-2]
 
 
-def empty(capacity: int) -> Superquadrics:
-    """`capacity` absent superquadrics: millimetre spheres at the origin, masked out."""
-    return Superquadrics(
+def empty(capacity: int, parts: int | None = None) -> Superquadrics:
+    """`capacity` absent superquadrics: millimetre spheres at the origin, masked out; with room for `parts` each."""
+    absent = Superquadrics(
         size=jnp.full((capacity, 3), 1e-3, jnp.float32),
         exponents=jnp.ones((capacity, 2)),
         position=jnp.zeros((capacity, 3)),
         rotation=jnp.broadcast_to(jnp.eye(3), (capacity, 3, 3)),
         valid=jnp.zeros(capacity, bool),
     )
+    if parts is None:
+        return absent
+    return absent.replace(parts=jax.tree.map(lambda a: jnp.stack([a] * parts, axis=1), absent))
 
 
 def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
@@ -67,7 +75,8 @@ def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
     missing = capacity - superquadrics.capacity
     if missing < 0:
         raise InputError(f"{superquadrics.capacity} objects do not fit a capacity of {capacity}; raise the capacity")
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[:missing]]), superquadrics, empty(capacity))
+    parts = None if superquadrics.parts is None else superquadrics.parts.capacity
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[:missing]]), superquadrics, empty(capacity, parts))
 
 
 def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
@@ -76,7 +85,8 @@ def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
     The best fit to an image has nearly the sharp edges of a real box. It hides more and is hit more than the rounded
     box of the same size in plans, so that f and g would depend on how an object was recognised.
     """
-    return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, EDGE_EXPONENT))
+    parts = None if superquadrics.parts is None else standard_edges(superquadrics.parts)
+    return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, EDGE_EXPONENT), parts=parts)
 
 
 def _power(base: Array, exponent: Array) -> Array:
@@ -142,6 +152,20 @@ def to_object_frame(superquadrics: Superquadrics, points: Float[Array, "... 3"])
 def bounding_radius(size: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
     """Radius of a sphere about the centre that contains a superquadric of any exponents up to 2 [m]."""
     return jnp.sqrt(jnp.sum(size**2, axis=-1))
+
+
+def support(
+    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], directions: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
+    """How far a superquadric reaches from its centre along vectors in its own frame, in their lengths [m].
+
+    The support function of the gauge's unit ball is the dual norm: nested norms with the conjugate powers.
+    """
+    size, exponents, directions = align((size, 1), (exponents, 1), (directions, 1))
+    x, y, z = jnp.moveaxis(jnp.abs(size * directions), -1, 0)
+    # Of octahedra, whose conjugate power is infinite, up to a fraction of a per cent.
+    r, p = jnp.moveaxis(1.0 / (1.0 - jnp.minimum(exponents, 1.99) / 2.0), -1, 0)
+    return _norm2(_norm2(x, y, p), z, r)
 
 
 def surface_directions(count: int) -> Float[np.ndarray, "count 3"]:

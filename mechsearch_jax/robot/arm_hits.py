@@ -6,6 +6,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.geometry.bodies import any_part, world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
 from mechsearch_jax.robot.gripper import arm_points
 
@@ -37,12 +38,13 @@ def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bo
       count: spheres for each capsule, see `arm_points`.
     """
     points, radius = arm_points(q, count)
-    n = scene.capacity
+    parts = world_parts(scene)
+    n = parts.capacity
     radii = jnp.broadcast_to(radius[:, None], (radius.shape[0], n))
     size, exponents = grown(
-        jnp.broadcast_to(scene.size[None], (*radii.shape, 3)),
-        jnp.broadcast_to(scene.exponents[None], (*radii.shape, 2)),
+        jnp.broadcast_to(parts.size[None], (*radii.shape, 3)),
+        jnp.broadcast_to(parts.exponents[None], (*radii.shape, 2)),
         radii,
     )
-    near = gauge(size[None], exponents[None], to_object_frame(scene, points)) < 1.0
-    return jnp.any(near, axis=1) & scene.valid[None]
+    near = gauge(size[None], exponents[None], to_object_frame(parts, points)) < 1.0
+    return any_part(scene, jnp.any(near, axis=1) & parts.valid[None])

@@ -107,6 +107,9 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
     if "['observation'].confidence" not in arrays:
         # Saved before objects said how sure they are.
         like = dataclasses.replace(like, observation=like.observation.replace(confidence=None))
+    if (size := arrays.get("['observation'].objects.parts.size")) is not None and size.ndim == 3:
+        objects = empty(MAX_OBJECTS, size.shape[1])
+        like = dataclasses.replace(like, observation=like.observation.replace(objects=objects))
     state = _restored(like, arrays, rest, path)
     return dataclasses.replace(state, observation=state.observation.judged())
 

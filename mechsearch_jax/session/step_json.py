@@ -10,6 +10,7 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -54,13 +55,16 @@ def _list(array: Any) -> list[Any]:
 
 def _is_finite(scene: Superquadrics) -> np.ndarray:
     """Which objects have finite shapes and poses; a warning names the others."""
-    parts = (scene.size, scene.exponents, scene.position, scene.rotation)
-    finite = [np.isfinite(np.asarray(part)).reshape(scene.capacity, -1).all(axis=1) for part in parts]
+    fields = jax.tree.leaves(scene.replace(valid=None))
+    finite = [np.isfinite(np.asarray(field)).reshape(scene.capacity, -1).all(axis=1) for field in fields]
     return np.logical_and.reduce(finite)
 
 
 def _objects(step: SearchStep) -> list[dict[str, Any]]:
-    """The recognised objects; `slot` is what an action's `object` refers to."""
+    """The recognised objects; `slot` is what an action's `object` refers to.
+
+    Bodies of several parts have `parts`, in their own frames, and `size` and `exponents` of what bounds these.
+    """
     scene, confidence = step.observation.objects, np.asarray(step.observation.judged().confidence)
     return [
         {
@@ -71,9 +75,19 @@ def _objects(step: SearchStep) -> list[dict[str, Any]]:
             "rotation": _list(scene.rotation[i]),
             "quaternion": np.roll(Rotation.from_matrix(np.asarray(scene.rotation[i], float)).as_quat(), 1).tolist(),
             "confidence": round(float(confidence[i]), 3),
+            **_parts(scene, i),
         }
         for i in np.flatnonzero(np.asarray(scene.valid) & _is_finite(scene)).tolist()
     ]
+
+
+def _parts(scene: Superquadrics, index: int) -> dict[str, Any]:
+    """The parts of a body, if bodies have parts."""
+    if (parts := scene.parts) is None:
+        return {}
+    there = np.flatnonzero(np.asarray(parts.valid[index])).tolist()
+    names = ("size", "exponents", "position", "rotation")
+    return {"parts": [{name: _list(getattr(parts, name)[index, p]) for name in names} for p in there]}
 
 
 def _target(step: SearchStep) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.text import Text
 from scipy.spatial import ConvexHull
 
+from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.runtime.files import PathLike, replacing
@@ -77,12 +78,16 @@ def rgb(colour: str) -> np.ndarray:
 
 
 def surfaces(scene: Superquadrics, grid: tuple[int, int] = (33, 97)) -> list[Float[np.ndarray, "points 3"] | None]:
-    """Points of each object's surface [m]; None for absent objects.
+    """Points of each object's surface [m], those of a body's parts one after the other; None for absent objects.
 
     Args:
       scene: the objects.
       grid: number of points from pole to pole, and around, where the last equals the first.
     """
+    if scene.parts is not None:
+        of_parts, p = surfaces(world_parts(scene), grid), scene.parts.capacity
+        bodies = [[points for points in of_parts[i : i + p] if points is not None] for i in range(0, len(of_parts), p)]
+        return [np.concatenate(parts) if parts else None for parts in bodies]
     elevation = np.linspace(-np.pi / 2, np.pi / 2, grid[0])[:, None]
     azimuth = np.linspace(-np.pi, np.pi, grid[1])[None, :]
 

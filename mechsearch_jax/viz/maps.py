@@ -125,7 +125,8 @@ class Maps:
     scene: Superquadrics
 
 
-_SCENE_FIELDS = tuple(field.name for field in dataclasses.fields(Superquadrics))
+# Of objects, and of their parts, if there are any, after `_OF_PARTS`.
+_SCENE_FIELDS, _OF_PARTS = ("size", "exponents", "position", "rotation", "valid"), "parts "
 
 
 def save_maps(maps: Maps, path: PathLike) -> None:
@@ -136,6 +137,8 @@ def save_maps(maps: Maps, path: PathLike) -> None:
     """
     arrays = {"poses": maps.poses, "existence": maps.existence, "graspability": maps.graspability}
     scene = {name: np.asarray(getattr(maps.scene, name)) for name in _SCENE_FIELDS}
+    if maps.scene.parts is not None:
+        scene |= {_OF_PARTS + name: np.asarray(getattr(maps.scene.parts, name)) for name in _SCENE_FIELDS}
     with replacing(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays, **scene)
 
@@ -148,7 +151,9 @@ def load_maps(path: PathLike) -> Maps:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            scene = Superquadrics(**{name: file[name] for name in _SCENE_FIELDS})
+            scene = Superquadrics(*(file[name] for name in _SCENE_FIELDS))
+            if _OF_PARTS + "size" in file:
+                scene = scene.replace(parts=Superquadrics(*(file[_OF_PARTS + name] for name in _SCENE_FIELDS)))
             return Maps(file["poses"], file["existence"], file["graspability"], scene)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error

@@ -74,7 +74,14 @@ def mesh_of(solids: Iterable[Solid]) -> Mesh:
 
 def meshes_of(scene: Superquadrics) -> list[Mesh | None]:
     """The surface of each object in the world; None for absent objects."""
-    return [points if points is None else Mesh(points.astype(np.float32), _faces()) for points in _points(scene)]
+    return [points if points is None else _surface_mesh(points) for points in _points(scene)]
+
+
+def _surface_mesh(points: Float[np.ndarray, "points 3"]) -> Mesh:
+    """The mesh of an object of one or more parts from the points of `drawing.surfaces`."""
+    rows, columns = GRID
+    first = np.arange(0, len(points), rows * columns, dtype=np.uint32)
+    return Mesh(points.astype(np.float32), (_faces()[None] + first[:, None, None]).reshape(-1, 3))
 
 
 def hand_mesh(T: Float[np.ndarray, "4 4"], opening: float) -> Mesh:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import placed_parts, world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, rotate, transform
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
@@ -65,7 +66,13 @@ def object_depth(
     origin: Float[Array, "3"],
     directions: Float[Array, "*batch 3"],
 ) -> Float[Array, "*batch"]:
-    """Depth of one object (a `Superquadrics` without its object axis) along world rays [m]; infinite for misses."""
+    """Depth of one object (a `Superquadrics` without its object axis) along world rays [m]; infinite for misses.
+
+    The depth of a body of several parts is the least of theirs.
+    """
+    if scene_object.parts is not None:
+        depths = jax.lax.map(lambda part: object_depth(part, origin, directions), placed_parts(scene_object))
+        return jnp.min(depths, axis=0)
     inverse = scene_object.rotation.T
     local_origin = rotate(inverse, origin - scene_object.position)
     local = rotate(inverse, directions)
@@ -85,7 +92,7 @@ def render_depth(camera: Camera, scene: Superquadrics) -> Float[Array, "h w"]:
       Depth along the optical axis [m], shape (height, width); infinite where no object is seen.
     """
     origin, directions = jnp.array(camera.position), rays(camera)
-    depths = jax.lax.map(lambda scene_object: object_depth(scene_object, origin, directions), scene)
+    depths = jax.lax.map(lambda part: object_depth(part, origin, directions), world_parts(scene))
     return jnp.min(depths, axis=0)
 
 
@@ -124,13 +131,19 @@ def window_place(
 
 
 @functools.partial(jax.jit, static_argnames=("window",))
-def object_window(camera: Camera, scene_object: Superquadrics, window: tuple[int, int]) -> Window:
-    """Depth of one object in a window of fixed size around its image, with a stride if the image is larger."""
+def object_window(
+    camera: Camera, scene_object: Superquadrics, window: tuple[int, int], part: Superquadrics | None = None
+) -> Window:
+    """Depth of one object in a window of fixed size around its image, with a stride if the image is larger.
+
+    If a part of it is given, in the world, the window is the same, but the depth that part's.
+    """
     corner, stride = window_place(camera, scene_object, window)
     rows, columns = jnp.meshgrid(jnp.arange(window[0]), jnp.arange(window[1]), indexing="ij")
     middle = (stride - 1) / 2.0
     row, column = rows * stride + corner[0] + middle, columns * stride + corner[1] + middle
-    depth = object_depth(scene_object, jnp.array(camera.position), pixel_rays(camera, row, column))
+    shown = scene_object if part is None else part
+    depth = object_depth(shown, jnp.array(camera.position), pixel_rays(camera, row, column))
     return Window(depth, corner, stride)
 
 

@@ -7,9 +7,9 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.geometry.footprints import QUARTER_TURN, Footprints
+from mechsearch_jax.geometry.footprints import QUARTER_TURN, Footprints, in_world
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
@@ -111,7 +111,8 @@ def object_grasps(
 ) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
     """Side grasps of objects that stand or lie on the board.
 
-    Round objects are grasped through their axis from directions spread over `max_yaw`, others by `config.boxes`.
+    Round objects are grasped through their axis from directions spread over `max_yaw`, others by `config.boxes`. A body
+    of several parts is grasped by those that fit between the fingers, in turns.
 
     Args:
       shelf: the shelf.
@@ -124,6 +125,9 @@ def object_grasps(
     Returns:
       Gripper poses in the world, in the order of `grasp_variants`, and whether the object fits between the fingers.
     """
+    if prints.parts is not None:
+        of_parts = object_grasps(shelf, gripper, in_world(prints), config, max_yaw, wrists)
+        return _by_turns(prints, *of_parts, grasp_variants(config, wrists)[0])
     box, _, tilt = grasp_variants(config, wrists)
     n, a, count = prints.yaw.shape[0], len(box), len(config.boxes)
     is_round = prints.round[:, None]
@@ -156,3 +160,26 @@ def object_grasps(
     y = prints.position[:, None, 1] - offset * jnp.sin(yaw)
     rotation = gripper_rotation(yaw, jnp.broadcast_to(jnp.asarray(tilt)[None], (n, a)))
     return make(rotation, jnp.stack([x, y, z], axis=-1)), fits & prints.valid[:, None]
+
+
+def _by_turns(
+    prints: Footprints, T: Float[Array, "parts a 4 4"], fits: Bool[Array, "parts a"], box: Int[np.ndarray, " a"]
+) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
+    """Of the grasps of all parts, those of each body: every variant is one of a part that it fits, the largest first.
+
+    Args:
+      prints: the bodies, with parts.
+      T, fits: of `object_grasps` for all parts.
+      box: index of each variant in `ObjectGraspConfig.boxes`, over which the parts take turns.
+    """
+    parts = prints.parts
+    assert parts is not None
+    n, p = parts.valid.shape
+    T, fits = T.reshape(n, p, *T.shape[1:]), fits.reshape(n, p, -1)
+    volume = jnp.where(parts.valid, parts.half[..., 0] * parts.half[..., 1] * (parts.high - parts.low), 0.0)
+    rank = jnp.sum((volume[:, None] > volume[:, :, None]) & parts.valid[:, None], axis=-1)
+    count = jnp.maximum(jnp.sum(parts.valid, axis=1), 1)
+    turn = (rank[..., None] - box[None, None]) % count[:, None, None]
+    part = jnp.argmin(jnp.where(fits, turn, p), axis=1)[:, None]
+    chosen = jnp.take_along_axis(T, part[..., None, None], axis=1)[:, 0]
+    return chosen, jnp.take_along_axis(fits, part, axis=1)[:, 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,8 @@ from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace
-from mechsearch_jax.dynamics.rigid import in_hand, pick_and_place
+from mechsearch_jax.dynamics.rigid import held_position, in_hand, pick_and_place
+from mechsearch_jax.geometry.bodies import slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
@@ -38,13 +40,13 @@ def _object_hits(T, owner, held, scene, clouds, distance, mask):
     Args:
       T: gripper poses, shape (C, 4, 4).
       owner: index of the grasped object, shape (C,).
-      held: its rotation in the hand, shape (C, 3, 3).
+      held: its pose in the hand, shape (C, 4, 4).
       scene, clouds: the objects and their surface points.
       distance: length of the motion [m].
       mask: which pairs to test, shape (C, N); must be False for the grasped object itself.
     """
     c, n = mask.shape
-    places = swept_places(make(held, scene.position[owner]), -T[:, :3, 2], distance)
+    places = swept_places(held, -T[:, :3, 2], distance)
     tested = jnp.repeat(mask, SWEPT_PLACES, axis=0)
     hits = collisions(
         clouds_of(clouds), jnp.repeat(owner, SWEPT_PLACES), places.reshape(-1, 4, 4), scene, tested, own=True
@@ -88,10 +90,13 @@ class PickAndPlace:
         """Which objects the grasped object hits on its way out, deeper than `contact_tolerance`."""
         n, config = scene.capacity, space.config
         owner = jnp.asarray(np.repeat(np.arange(n), len(self.wrists(space))))
-        held = jax.vmap(lambda index, T: in_hand(scene, index, T))(owner, T)
-        slim = scene.replace(size=jnp.maximum(scene.size - config.contact_tolerance, 0.5 * scene.size))
-        clouds = object_clouds(slim, config.object_points)
-        return _object_hits(T, owner, held, scene, clouds, space.gripper.approach, mask)
+        turned = jax.vmap(lambda index, T: in_hand(scene, index, T))(owner, T)
+        if scene.parts is None:
+            place = scene.position[owner]
+        else:
+            place = jax.vmap(functools.partial(held_position, scene))(owner, T, turned)
+        clouds = object_clouds(slimmed(scene, config.contact_tolerance, 0.5), config.object_points)
+        return _object_hits(T, owner, make(turned, place), scene, clouds, space.gripper.approach, mask)
 
     def entering(
         self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates

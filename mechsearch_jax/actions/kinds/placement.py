@@ -20,8 +20,8 @@ from mechsearch_jax.actions.approach import (
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
-from mechsearch_jax.dynamics.rigid import in_hand
-from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.dynamics.rigid import held_position, in_hand
+from mechsearch_jax.geometry.bodies import enlarged, surface_of
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -88,12 +88,14 @@ def placement(
       Whether a place is possible, `T_world_gripper` at the release, and `T_world_object` there.
     """
     index, T_grasp = grasp.object, grasp.T_world_gripper
-    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
+    cloud = surface_of(scene, index, space.config.object_points)
     position, rotation, turn, stands = _drawn_places(key, space, scene, possible, cloud, grasp)
     # The object turns about its centre, and the gripper with it.
-    arm = T_grasp[:3, 3] - scene.position[index]
+    in_fingers = in_hand(scene, index, T_grasp)
+    middle = held_position(scene, index, T_grasp, in_fingers)
+    arm = T_grasp[:3, 3] - middle
     T_place = make(matmul(yaw_rotation(turn), T_grasp[:3, :3]), rotate(yaw_rotation(turn), arm) + position)
-    held = make(in_hand(scene, index, T_grasp), scene.position[index])
+    held = make(in_fingers, middle)
     T_world_gripper = jnp.concatenate([T_grasp[None], T_place])
     T_world_object = jnp.concatenate([held[None], make(rotation, position)])
     wanted = jnp.concatenate([grasp.wanted[None], stands & grasp.wanted])
@@ -122,7 +124,7 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
     on_board &= jnp.min(points[..., 0], axis=1) > shelf.front + config.clearance
     obstacles = scene.valid & (jnp.arange(scene.capacity) != index) & grasp.wanted
-    wider = scene.replace(size=scene.size + config.clearance)
+    wider = enlarged(scene, config.clearance)
     mask = obstacles[None] & on_board[:, None]
     body = clouds_of(cloud.T[None])
     overlaps = collisions(body, np.zeros(tries, np.int32), make(rotation, position), wider, mask, own=True)
@@ -187,7 +189,7 @@ def _gripper_meets(
     T_world_gripper, _, wanted = ends
     n, w, tables = obstacles.capacity, len(T_world_gripper), space.tables
     swept, still = (cloud_index(tables, OPEN, wrist, at_rest) for at_rest in (False, True))
-    wider = obstacles.replace(size=obstacles.size + space.config.clearance)
+    wider = enlarged(obstacles, space.config.clearance)
     objects = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wider, obstacles)
     crossings, crosses = crossing_places(space, T_world_gripper)
     places = jnp.concatenate([T_world_gripper[1:], crossings.reshape(-1, 4, 4)])

@@ -25,6 +25,7 @@ from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.geometry.bodies import slimmed
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -126,7 +127,7 @@ def gripper_meets(
       pushes: whether the action is a push; if not, the result is False.
     """
     n, k, tables = scene.capacity, PUSH_PLACES, space.tables
-    slim = after.replace(size=jnp.maximum(after.size - TOUCHING, 0.5 * after.size))
+    slim = slimmed(after, TOUCHING, 0.5)
     ends = jnp.stack([action.T_world_gripper, action.T_world_place])
     share = (jnp.arange(k) + 1.0) / k
     along = translate(jnp.broadcast_to(ends[0], (k, 4, 4)), share[:, None] * action.displacement[None])

@@ -119,7 +119,8 @@ def _half_extents(scene: Superquadrics, vectors: Float[np.ndarray, "v 2"]) -> Fl
 def object_pushes(
     space: ActionSpace, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
-    """Gripper poses where pushes start, at `push_gap` from each object, and their sampling weights.
+    """Gripper poses where pushes start, at `push_gap` from each object, or from the footprint that bounds a body of
+    several parts, and their sampling weights.
 
     The weight is 1 if the first contact is so low that it cannot topple the object, else 0. Computed for `fresh`
     objects only, in the order of `push_starts`.
@@ -156,7 +157,7 @@ def object_pushes(
         lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
         return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
 
-    bodies = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints)
+    bodies = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints.replace(parts=None))
     rows = (bodies, T[:, first].reshape(-1, 4, 4), np.tile(headings, (n, 1)))
     measured = masked_vmap(clear, jnp.repeat(fresh, len(first)), (shelf, space.tables.pusher), None, rows)
     distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in measured)

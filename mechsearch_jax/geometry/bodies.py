@@ -1,0 +1,187 @@
+"""Rigid bodies of several superquadrics.
+
+Bodies are `Superquadrics` with `parts`, which lie in the body's frame: a body that moves changes its own pose and
+nothing else. It is hit and seen where any of its parts is. Its own superquadric bounds all parts and stands for it
+where only its place and its extent count.
+
+Whatever reads shapes does so through these functions. For scenes without parts, where every body is one superquadric,
+they return what they are given.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import EDGE_EXPONENT, Superquadrics
+from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform
+
+# Largest number of parts of a body.
+PARTS = 4
+# Points on each part that decide how round the superquadric is that bounds a body, and the largest gauge that counts as
+# bounded: but for rounding, and but for the rims of cylinders, which are rounded in proportion to their height.
+BOUNDED_POINTS, BOUNDED, RIM = 128, 1.01, 1.08
+# Largest ratio of the first two half-extents of a body that counts as round.
+ROUND = 1.05
+# Exponents e1 and e2 below which a bounding superquadric is a box.
+BOX = (EDGE_EXPONENT, EDGE_EXPONENT)
+
+
+def placed_parts(scene: Superquadrics) -> Superquadrics:
+    """The parts of bodies in the world, fields (..., P, ...); the bodies must have parts. Parts of absent bodies are
+    absent."""
+    parts = scene.parts
+    assert parts is not None
+    turn = scene.rotation[..., None, :, :]
+    return parts.replace(
+        position=rotate(turn, parts.position) + scene.position[..., None, :],
+        rotation=matmul(turn, parts.rotation),
+        valid=parts.valid & scene.valid[..., None],
+    )
+
+
+def world_parts(scene: Superquadrics) -> Superquadrics:
+    """All parts of a scene's bodies in the world, one after the other, fields (N P, ...)."""
+    if scene.parts is None:
+        return scene
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), placed_parts(scene))
+
+
+def per_part(scene: Superquadrics, values: Shaped[Array, "*batch n"]) -> Shaped[Array, "*batch parts"]:
+    """The value of its body for each of `world_parts`, along the last axis."""
+    if scene.parts is None:
+        return values
+    return jnp.repeat(values, scene.parts.capacity, axis=-1)
+
+
+def any_part(scene: Superquadrics, values: Bool[Array, "*batch parts"]) -> Bool[Array, "*batch n"]:
+    """For which bodies a statement holds that holds for any of their `world_parts`, along the last axis."""
+    if scene.parts is None:
+        return values
+    return jnp.any(values.reshape(*values.shape[:-1], scene.capacity, scene.parts.capacity), axis=-1)
+
+
+def enlarged(scene: Superquadrics, by: Array | float) -> Superquadrics:
+    """The bodies with all half-extents larger [m]."""
+    parts = None if scene.parts is None else enlarged(scene.parts, by)
+    return scene.replace(size=scene.size + by, parts=parts)
+
+
+def slimmed(scene: Superquadrics, by: Array | float, least: float) -> Superquadrics:
+    """The bodies with all half-extents smaller, by a length [m], but to no less than a share `least` of them."""
+    parts = None if scene.parts is None else slimmed(scene.parts, by, least)
+    return scene.replace(size=jnp.maximum(scene.size - by, least * scene.size), parts=parts)
+
+
+def surfaces(scene: Superquadrics, count: int) -> Float[Array, "n points 3"]:
+    """Points on the surface of every body in its own frame [m], `count` on each of its parts."""
+    if scene.parts is None:
+        return superquadric.sample_surface(scene.size, scene.exponents, count)
+    return _parts_surface(scene.parts, count)
+
+
+def surface_of(scene: Superquadrics, index: Int[Array, ""], count: int) -> Float[Array, "points 3"]:
+    """The points of `surfaces` on one body."""
+    if scene.parts is None:
+        return superquadric.sample_surface(scene.size[index], scene.exponents[index], count)
+    return _parts_surface(jax.tree.map(lambda a: a[index], scene.parts), count)
+
+
+def _parts_surface(parts: Superquadrics, count: int) -> Float[Array, "*batch points 3"]:
+    """Points on parts in their body's frame [m]; those of absent parts repeat those of the first that there is."""
+    first = jnp.argmax(parts.valid, axis=-1)
+    which = jnp.where(parts.valid, jnp.arange(parts.capacity).reshape(*[1] * first.ndim, -1), first[..., None])
+    parts = jax.tree.map(lambda a: _along(a, which), parts)
+    points = superquadric.sample_surface(parts.size, parts.exponents, count)
+    points = transform(make(parts.rotation, parts.position)[..., None, :, :], points)
+    return points.reshape(*points.shape[:-3], -1, 3)
+
+
+def _along(array: Shaped[Array, "*batch p _*rest"], index: Int[Array, "*batch p"]) -> Shaped[Array, "*batch p _*rest"]:
+    """Entries along the axis of the parts."""
+    wide = index.reshape(*index.shape, *[1] * (array.ndim - index.ndim))
+    return jnp.take_along_axis(array, wide, axis=index.ndim - 1)
+
+
+def part_at(scene: Superquadrics, index: Int[Array, ""], point: Float[Array, "3"]) -> Int[Array, ""]:
+    """The part of a body, which must have parts, that a point in the world [m] is in, or is nearest to in its size."""
+    parts = placed_parts(jax.tree.map(lambda a: a[index], scene))
+    gauge = superquadric.gauge(parts.size, parts.exponents, superquadric.to_object_frame(parts, point))
+    return jnp.argmin(jnp.where(parts.valid, gauge, jnp.inf))
+
+
+def grasped_shape(scene: Superquadrics, index: Int[Array, ""], point: Float[Array, "3"]) -> Superquadrics:
+    """What of a body is between finger tips around a point in the world [m]: the `part_at` the point, or the body if it
+    has no parts; in the world, without the axis of the objects."""
+    body = jax.tree.map(lambda a: a[index], scene)
+    if scene.parts is None:
+        return body
+    return jax.tree.map(lambda a: a[part_at(scene, index, point)], placed_parts(body))
+
+
+def with_parts(scene: Superquadrics, parts: int = PARTS) -> Superquadrics:
+    """The same bodies with room for `parts` parts each; a body that is one superquadric becomes its only part."""
+    if scene.parts is not None:
+        return scene
+    own = scene.replace(
+        position=jnp.zeros_like(scene.position),
+        rotation=jnp.broadcast_to(jnp.eye(3, dtype=scene.rotation.dtype), scene.rotation.shape),
+    )
+    axis = scene.valid.ndim
+    stacked = jax.tree.map(lambda a: jnp.stack([a] * parts, axis=axis), own)
+    only = jnp.arange(parts).reshape(*[1] * axis, parts) == 0
+    return scene.replace(parts=stacked.replace(valid=stacked.valid & only))
+
+
+def bodies_of(
+    parts: Superquadrics, position: Float[Array, "*batch 3"], rotation: Float[Array, "*batch 3 3"]
+) -> Superquadrics:
+    """Bodies of parts that are given in any frame of theirs.
+
+    A body's own frame is turned like the given one, with its origin in the middle of the parts' bounding box; that box
+    gives the half-extents of its bounding superquadric. The exponents are the first that bound all parts: the largest
+    of the parts; a cylinder's with the largest e2, if the body is as broad as long; a box's.
+
+    Args:
+      parts: fields (..., P, ...), posed in the given frames.
+      position, rotation: of these frames in the world; any leading axes.
+
+    Returns:
+      The bodies, which are present where any part is.
+    """
+    there = parts.valid[..., None]
+    # The rows of the rotation are the frame's axes in the part's frame.
+    reach = superquadric.support(parts.size[..., None, :], parts.exponents[..., None, :], parts.rotation)
+    valid = jnp.any(parts.valid, axis=-1)
+    low, high = (
+        jnp.where(valid[..., None], sign * jnp.min(jnp.where(there, side, jnp.inf), axis=-2), sign * -1e-3)
+        for sign, side in ((1.0, parts.position - reach), (-1.0, -parts.position - reach))
+    )
+    size, centre = 0.5 * (high - low), 0.5 * (high + low)
+    centred = parts.replace(position=parts.position - centre[..., None, :])
+    return Superquadrics(
+        size=size,
+        exponents=_bounding_exponents(centred, size),
+        position=rotate(rotation, centre) + position,
+        rotation=jnp.broadcast_to(rotation, (*valid.shape, 3, 3)),
+        valid=valid,
+        parts=centred,
+    )
+
+
+def _bounding_exponents(parts: Superquadrics, size: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
+    """The roundest exponents with which superquadrics of these half-extents bound parts; see `bodies_of`."""
+    roundest = jnp.max(jnp.where(parts.valid[..., None], parts.exponents, 0.0), axis=-2)
+    roundest = jnp.where(jnp.any(parts.valid, axis=-1, keepdims=True), roundest, 1.0)
+    cylinder = roundest.at[..., 0].set(EDGE_EXPONENT)
+    points = _parts_surface(parts, BOUNDED_POINTS)
+
+    def outermost(exponents):
+        return jnp.max(superquadric.gauge(size[..., None, :], exponents[..., None, :], points), axis=-1)
+
+    is_round = jnp.max(size[..., :2], axis=-1) <= ROUND * jnp.min(size[..., :2], axis=-1)
+    is_cylinder = is_round & (outermost(cylinder) <= RIM)
+    box = jnp.where(is_cylinder[..., None], cylinder, jnp.broadcast_to(jnp.float32(BOX), roundest.shape))
+    return jnp.where((outermost(roundest) <= BOUNDED)[..., None], roundest, box)
