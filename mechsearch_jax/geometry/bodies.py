@@ -113,12 +113,10 @@ def part_at(scene: Superquadrics, index: Int[Array, ""], point: Float[Array, "3"
 
 
 def grasped_shape(scene: Superquadrics, index: Int[Array, ""], point: Float[Array, "3"]) -> Superquadrics:
-    """What of a body is between finger tips around a point in the world [m]: the `part_at` the point, or the body if it
-    has no parts; in the world, without the axis of the objects."""
-    body = jax.tree.map(lambda a: a[index], scene)
-    if scene.parts is None:
-        return body
-    return jax.tree.map(lambda a: a[part_at(scene, index, point)], placed_parts(body))
+    """What of a body is between finger tips around a point in the world [m]: the `part_at` the point, in the world,
+    without the axis of the objects. The body must have parts."""
+    parts = placed_parts(jax.tree.map(lambda a: a[index], scene))
+    return jax.tree.map(lambda a: a[part_at(scene, index, point)], parts)
 
 
 def with_parts(scene: Superquadrics, parts: int = PARTS) -> Superquadrics:
