@@ -111,10 +111,10 @@ def _meets_own_parts(
 
     Args:
       scene: the bodies, with parts.
-      clouds: that the gripper sweeps, and `cloud`, their indices for the K = N V grasps.
-      cloud: see `clouds`.
+      clouds: that the gripper sweeps.
+      cloud: index of the cloud of each of the K = N V grasps.
       T: poses of the gripper.
-      tested: which of them are tested; the result is False for the others.
+      tested: which grasps are tested; the result is False for the others.
     """
     (n, v), shapes = tested.shape, world_parts(scene)
     owner, T = np.repeat(np.arange(n), v), T.reshape(-1, 4, 4)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from mechsearch_jax.geometry.bodies import grasped_shape
 from mechsearch_jax.geometry.footprints import QUARTER_TURN, headings, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, matmul, rotate, transform, yaw_rotation
+from mechsearch_jax.geometry.transforms import compose, inverse, make, matmul, rotate, transform, yaw_rotation
 
 
 def rigid_motion(
@@ -27,7 +27,7 @@ def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Ar
 
     An approximation: an object with flat sides turns about its vertical axis until the nearest side lies flat against
     a finger, and does not shift; a round object stays as it is. Of a body of several parts it is the grasped one that
-    turns about its centre or stays, and takes the others with it: see `held_position`.
+    turns about its centre or stays, and takes the others with it.
     """
     rotation = scene.rotation[index]
     if scene.parts is None:
@@ -40,16 +40,14 @@ def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Ar
     return matmul(yaw_rotation(jnp.where(now.round, 0.0, skew)), rotation)
 
 
-def held_position(
-    scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"], held: Float[Array, "3 3"]
-) -> Float[Array, "3"]:
-    """Position of an object, or of a body's frame, once it is turned to `held`, its rotation `in_hand` [m]."""
-    position = scene.position[index]
+def held_pose(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+    """`T_world_object` of an object once the fingers have closed on it, turned `in_hand`."""
+    rotation, position = in_hand(scene, index, T_world_grasp), scene.position[index]
     if scene.parts is None:
-        return position
+        return make(rotation, position)
     middle = grasped_shape(scene, index, T_world_grasp[:3, 3]).position
-    turn = matmul(held, scene.rotation[index].T)
-    return middle + rotate(turn, position - middle)
+    turn = matmul(rotation, scene.rotation[index].T)
+    return make(rotation, middle + rotate(turn, position - middle))
 
 
 def pick_and_place(
@@ -57,9 +55,9 @@ def pick_and_place(
 ) -> Superquadrics:
     """The scene after an object, turned `in_hand`, has moved with the gripper from one pose to the other."""
     motion = compose(T_world_place, inverse(T_world_grasp))
-    held = in_hand(scene, index, T_world_grasp)
-    position = transform(motion, held_position(scene, index, T_world_grasp, held))
-    rotation = matmul(motion[:3, :3], held)
+    held = held_pose(scene, index, T_world_grasp)
+    position = transform(motion, held[:3, 3])
+    rotation = matmul(motion[:3, :3], held[:3, :3])
     return scene.replace(
         position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
     )

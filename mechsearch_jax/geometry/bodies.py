@@ -20,13 +20,11 @@ from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform
 
 # Largest number of parts of a body.
 PARTS = 4
-# Points on each part that decide how round the superquadric is that bounds a body, and the largest gauge that counts as
-# bounded: but for rounding, and but for the rims of cylinders, which are rounded in proportion to their height.
+# Points on each part that decide how round the superquadric is that bounds a body, and the largest gauge of a point
+# that counts as bounded. A rim is rounded in proportion to a cylinder's height: those of shorter ones stick out a little.
 BOUNDED_POINTS, BOUNDED, RIM = 128, 1.01, 1.08
-# Largest ratio of the first two half-extents of a body that counts as round.
+# Largest ratio of the first two half-extents of a body of several parts that counts as round.
 ROUND = 1.05
-# Exponents e1 and e2 below which a bounding superquadric is a box.
-BOX = (EDGE_EXPONENT, EDGE_EXPONENT)
 
 
 def placed_parts(scene: Superquadrics) -> Superquadrics:
@@ -181,5 +179,5 @@ def _bounding_exponents(parts: Superquadrics, size: Float[Array, "*batch 3"]) ->
 
     is_round = jnp.max(size[..., :2], axis=-1) <= ROUND * jnp.min(size[..., :2], axis=-1)
     is_cylinder = is_round & (outermost(cylinder) <= RIM)
-    box = jnp.where(is_cylinder[..., None], cylinder, jnp.broadcast_to(jnp.float32(BOX), roundest.shape))
+    box = jnp.where(is_cylinder[..., None], cylinder, jnp.full_like(roundest, EDGE_EXPONENT))
     return jnp.where((outermost(roundest) <= BOUNDED)[..., None], roundest, box)

@@ -24,11 +24,10 @@ from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace
-from mechsearch_jax.dynamics.rigid import held_position, in_hand, pick_and_place
+from mechsearch_jax.dynamics.rigid import held_pose, pick_and_place
 from mechsearch_jax.geometry.bodies import slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
 
 CODE = 2
@@ -90,13 +89,9 @@ class PickAndPlace:
         """Which objects the grasped object hits on its way out, deeper than `contact_tolerance`."""
         n, config = scene.capacity, space.config
         owner = jnp.asarray(np.repeat(np.arange(n), len(self.wrists(space))))
-        turned = jax.vmap(lambda index, T: in_hand(scene, index, T))(owner, T)
-        if scene.parts is None:
-            place = scene.position[owner]
-        else:
-            place = jax.vmap(functools.partial(held_position, scene))(owner, T, turned)
+        held = jax.vmap(functools.partial(held_pose, scene))(owner, T)
         clouds = object_clouds(slimmed(scene, config.contact_tolerance, 0.5), config.object_points)
-        return _object_hits(T, owner, make(turned, place), scene, clouds, space.gripper.approach, mask)
+        return _object_hits(T, owner, held, scene, clouds, space.gripper.approach, mask)
 
     def entering(
         self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates

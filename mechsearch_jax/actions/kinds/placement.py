@@ -20,7 +20,7 @@ from mechsearch_jax.actions.approach import (
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
-from mechsearch_jax.dynamics.rigid import held_position, in_hand
+from mechsearch_jax.dynamics.rigid import held_pose, in_hand
 from mechsearch_jax.geometry.bodies import enlarged, surface_of
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap, taken
@@ -91,11 +91,9 @@ def placement(
     cloud = surface_of(scene, index, space.config.object_points)
     position, rotation, turn, stands = _drawn_places(key, space, scene, possible, cloud, grasp)
     # The object turns about its centre, and the gripper with it.
-    in_fingers = in_hand(scene, index, T_grasp)
-    middle = held_position(scene, index, T_grasp, in_fingers)
-    arm = T_grasp[:3, 3] - middle
+    held = held_pose(scene, index, T_grasp)
+    arm = T_grasp[:3, 3] - held[:3, 3]
     T_place = make(matmul(yaw_rotation(turn), T_grasp[:3, :3]), rotate(yaw_rotation(turn), arm) + position)
-    held = make(in_fingers, middle)
     T_world_gripper = jnp.concatenate([T_grasp[None], T_place])
     T_world_object = jnp.concatenate([held[None], make(rotation, position)])
     wanted = jnp.concatenate([grasp.wanted[None], stands & grasp.wanted])
