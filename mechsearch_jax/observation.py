@@ -13,7 +13,7 @@ class Observation(flax.struct.PyTreeNode):
     """The recognised scene at one moment; every field may have leading batch axes.
 
     Attributes:
-      objects: the recognised objects, without the target, fields (..., N, ...).
+      objects: the recognised objects, without the target, fields (..., N, ...); each may have several parts.
       target_visible: whether the target is visible, bool, shape (...).
       target_pose: x, y [m] and yaw [rad] in the world, shape (..., 3); arbitrary if it is not visible.
       confidence: the probability that each object is where it is and as it is, to 2 cm and 15 degrees, shape (..., N);

@@ -21,7 +21,7 @@ from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform
 # Largest number of parts of a body.
 PARTS = 4
 # Points on each part that decide how round the superquadric is that bounds a body, and the largest gauge of a point
-# that counts as bounded. A rim is rounded in proportion to a cylinder's height: those of shorter ones stick out a little.
+# that counts as bounded. A rim is rounded in proportion to a cylinder's height: shorter ones' stick out a little.
 BOUNDED_POINTS, BOUNDED, RIM = 128, 1.01, 1.08
 # Largest ratio of the first two half-extents of a body of several parts that counts as round.
 ROUND = 1.05
