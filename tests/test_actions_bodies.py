@@ -47,13 +47,13 @@ def scene_of(*those):
     return superquadric.pad(jax.tree.map(lambda *a: jnp.stack(a), *those), SLOTS)
 
 
-def mug(place, yaw=0.0, radius=0.034, tall=0.07, back=0.015):
-    """A mug whose handle points along its first axis."""
+def mug(place, yaw=0.0, radius=0.034, tall=0.07, back=0.015, share=0.6):
+    """A mug whose handle points along its first axis, and is as high as a share of it."""
     return body(
         place,
         yaw,
         ((radius, radius, tall), CYLINDER, (0.0, 0.0, tall)),
-        ((back, 0.008, 0.6 * tall), BOX, (radius + back - 0.002, 0.0, tall)),
+        ((back, 0.008, share * tall), BOX, (radius + back - 0.002, 0.0, tall)),
     )
 
 
@@ -196,8 +196,8 @@ def test_no_grasp_passes_through_another_part_of_the_same_body(problem):
     possible = possible_space(problem, belief, belief.exists & False)
     picks = [kind.surrounds_object for kind in SAMPLED_KINDS].index(True)
     candidates = jax.jit(lambda scene: all_candidates(problem.space, scene, possible)[picks])
-    free = scene_of(mug((0.55, 0.1), np.pi / 2, back=0.03))
-    towards = scene_of(mug((0.55, 0.1), np.pi, back=0.03))
+    free = scene_of(mug((0.55, 0.1), np.pi / 2, back=0.03, share=0.95))
+    towards = scene_of(mug((0.55, 0.1), np.pi, back=0.03, share=0.95))
     for scene, some in ((free, True), (towards, False)):
         found = candidates(scene)
         held = jax.vmap(lambda T, scene=scene: bodies.part_at(scene, jnp.int32(0), T[:3, 3]))(found.T_world_gripper[0])

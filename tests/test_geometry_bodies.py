@@ -106,7 +106,7 @@ def test_two_identical_parts_are_one(seed):
     scene = single(seed)
     twice = bodies.with_parts(scene, 2)
     twice = twice.replace(parts=jax.tree.map(lambda a: a[:, [0, 0]], twice.parts))
-    for answer in (hits, touched, windows):
+    for answer in (hits, touched, windows, lambda some: bodies.surfaces(some, 64)[:-1]):
         same(answer(scene), answer(twice))
     again = bodies.bodies_of(twice.parts, twice.position, twice.rotation)
     there = np.asarray(scene.valid)
@@ -187,15 +187,19 @@ def test_parts_move_with_their_body():
     np.testing.assert_allclose(moved.position, transform(T, still.position), atol=1e-6)
 
 
-def test_absent_parts_have_no_surface_of_their_own():
+def test_parts_that_there_are_share_the_points_of_a_body():
     scene = drawn(7)
-    points = np.asarray(bodies.surfaces(scene, 32)).reshape(3, 3, 32, 3)
-    valid = np.asarray(scene.parts.valid)
+    points, valid = bodies.surfaces(scene, 96), np.asarray(scene.parts.valid)
     assert not valid[:2].all()
     assert valid[:2].any(axis=1).all()
-    for body, part in np.argwhere(~valid[:2]):
-        np.testing.assert_array_equal(points[body, part], points[body, np.argmax(valid[body])])
-    np.testing.assert_array_equal(bodies.surface_of(scene, jnp.int32(1), 32), points[1].reshape(-1, 3))
+    for i in range(2):
+        own = jax.tree.map(lambda a, i=i: a[i], scene.parts)
+        local = superquadric.to_object_frame(own, points[i])
+        near = np.abs(np.asarray(superquadric.gauge(own.size, own.exponents, local)) - 1.0) < 1e-3
+        np.testing.assert_array_equal(near[:, valid[i]].sum(axis=0) >= 96 // valid[i].sum(), True)
+        assert near[:, valid[i]].any(axis=1).all()
+        np.testing.assert_array_equal(bodies.surface_of(scene, jnp.int32(i), 96), points[i])
+    np.testing.assert_allclose(bodies.surfaces(permuted(scene, 0), 96)[:2], points[:2], atol=1e-6)
 
 
 def test_bodies_fill_slots_as_superquadrics_do():

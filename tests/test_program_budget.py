@@ -14,16 +14,20 @@ import pytest
 import mechsearch_jax as ms
 from mechsearch_jax.belief.belief import without_grasps
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import policies
 
 # Equations and loops (`while`, `scan` and `cond`) of one decision: 30 sequences of 3 actions, 9 slots. The programs for
-# a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found.
+# a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found; and those of
+# scenes with room for bodies of several parts.
 BUDGET = {
     ("cpu", "hidden"): (16_416, 58),
     ("cpu", "found"): (18_107, 74),
     ("gpu", "hidden"): (18_244, 65),
     ("gpu", "found"): (19823, 83),
+    ("cpu", "hidden", "parts"): (0, 0),
+    ("gpu", "found", "parts"): (0, 0),
 }
 # Versions of JAX write the same program with a few equations more or less.
 SLACK = 1.01
@@ -68,25 +72,25 @@ def test_what_is_inside_loops_and_calls_counts_each_time():
     assert counts["while"] + counts["scan"] == 2
 
 
-def decision(problem, belief):
-    """The program of a decision for a belief."""
+def decision(problem, belief, parts=None):
+    """The program of a decision for a belief, with room for so many parts of each body."""
     settings = ms.search_for_grasp(sequences=30, horizon=3)
-    seen = Observation(objects=superquadric.empty(8), target_visible=jnp.array(False), target_pose=jnp.zeros(3))
+    seen = Observation(objects=superquadric.empty(8, parts), target_visible=jnp.array(False), target_pose=jnp.zeros(3))
     plan = lambda key, problem, belief: policies._plan.__wrapped__(settings, key, problem, belief, seen)  # noqa: E731
     return jax.make_jaxpr(plan)(jax.random.key(0), problem, belief).jaxpr
 
 
 @pytest.mark.parametrize(
-    ("device", "target"),
+    "case",
     [
-        # The largest.
+        # The largest of the default.
         ("gpu", "found"),
-        pytest.param("cpu", "hidden", marks=pytest.mark.slow),
-        pytest.param("cpu", "found", marks=pytest.mark.slow),
-        pytest.param("gpu", "hidden", marks=pytest.mark.slow),
+        *(pytest.param(case, marks=pytest.mark.slow) for case in BUDGET if case != ("gpu", "found")),
     ],
+    ids="-".join,
 )
-def test_a_decision_stays_within_its_budget(monkeypatch, problem, device, target):
+def test_a_decision_stays_within_its_budget(monkeypatch, problem, case):
+    device, target, *parts = case
     belief = ms.initial_belief(problem)
     if target == "hidden":
         belief = without_grasps(belief)
@@ -94,12 +98,12 @@ def test_a_decision_stays_within_its_budget(monkeypatch, problem, device, target
     monkeypatch.setattr(jax, "default_backend", lambda: device)
     jax.clear_caches()
     try:
-        counts = primitives(decision(problem, belief))
+        counts = primitives(decision(problem, belief, PARTS if parts else None))
     finally:
         jax.clear_caches()
-    equations, loops = BUDGET[device, target]
+    equations, loops = BUDGET[case]
     counted = counts.total(), sum(counts[name] for name in LOOPS)
     allowed = math.floor(SLACK * equations), loops
     assert counted[0] <= allowed[0] and counted[1] <= allowed[1], (  # noqa: PT018
-        f"{counted} equations and loops for {device}, {target}, of {allowed}: they may rise only with a measured gain"
+        f"{counted} equations and loops for {', '.join(case)}, of {allowed}: they may rise only with a measured gain"
     )

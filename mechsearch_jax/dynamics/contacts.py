@@ -5,11 +5,13 @@ Bodies of several parts touch with the footprints of these, and each contact is 
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.geometry.footprints import Footprints, dot, in_world, turned
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.workspace.shelf import Shelf
 
 BOUNDARY_POINTS = 24
@@ -51,32 +53,18 @@ def outline_points(prints):
     return turned(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
 
 
-def of_bodies(prints, depth, *vectors):
-    """The deepest of the contacts of each body's parts: its depth (..., N), and vectors (..., N, 2)."""
-    if prints.parts is None:
-        return depth, *vectors
-    shape = (*depth.shape[:-1], *prints.parts.valid.shape)
-    depth, vectors = depth.reshape(shape), [v.reshape(*shape, 2) for v in vectors]
-    i = jnp.argmax(depth, axis=-1)[..., None]
-    chosen = (jnp.take_along_axis(v, i[..., None], axis=-2)[..., 0, :] for v in vectors)
-    return jnp.take_along_axis(depth, i, axis=-1)[..., 0], *chosen
-
-
-def from_centres(prints, arm):
-    """Vectors (..., N P, 2) from the centres of parts as vectors from the centres of their bodies."""
-    if prints.parts is None:
-        return arm
-    offset = turned(prints.yaw[:, None], prints.parts.position).reshape(-1, 2)
-    return arm + offset.reshape(*[1] * (arm.ndim - 2), -1, 2)
-
-
 def pusher_contacts(prints, points):
     """Of each footprint with the gripper's points: the depth, the direction in which it gives way, and the place of the
     contact from its centre."""
     shapes = in_world(prints)
     depth, point = deepest(*pusher_depth(shapes, points))
     away = -turned(shapes.yaw, point_normal(shapes.half, shapes.round, point))
-    return of_bodies(prints, depth, away, from_centres(prints, turned(shapes.yaw, point)))
+    arm = turned(shapes.yaw, point)
+    if prints.parts is None:
+        return depth, away, arm
+    n, p = prints.parts.valid.shape
+    arm = arm.reshape(n, p, 2) + turned(prints.yaw[:, None], prints.parts.position)
+    return _deepest_of(depth.reshape(n, p), away.reshape(n, p, 2), arm)
 
 
 def pusher_depth(prints, points):
@@ -90,23 +78,8 @@ def pusher_depth(prints, points):
 def pair_contacts(prints):
     """For every ordered pair (i, j): the deepest contact, the direction in which j has to give way, and the place from
     its centre."""
-    if prints.parts is None:
-        return _pair_contacts(prints, ~jnp.eye(prints.valid.size, dtype=bool))
-    shapes, (n, p) = in_world(prints), prints.parts.valid.shape
-    other = jnp.repeat(jnp.repeat(~jnp.eye(n, dtype=bool), p, axis=0), p, axis=1)
-    # Parts may pass above each other.
-    level = jnp.maximum(shapes.low[:, None], shapes.low[None]) < jnp.minimum(shapes.high[:, None], shapes.high[None])
-    depth, direction, arm = _pair_contacts(shapes, other & level)
-    depth, direction, arm = of_bodies(prints, depth, direction, from_centres(prints, arm))
-    # The deepest of the parts of i with each j.
-    i = jnp.argmax(depth.reshape(n, p, n), axis=1)
-    rows = i + p * jnp.arange(n)[:, None]
-    columns = jnp.arange(n)[None]
-    return depth[rows, columns], direction[rows, columns], arm[rows, columns]
-
-
-def _pair_contacts(prints, other):
-    """`pair_contacts` of single shapes, where `other` says which pairs can touch."""
+    if prints.parts is not None:
+        return _body_contacts(prints)
     outline = outline_points(prints)
     into_j = turned(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
     depth, point = deepest(point_depth(prints.half[None, :, None, :], prints.round[None, :, None], into_j), into_j)
@@ -119,8 +92,55 @@ def _pair_contacts(prints, other):
     other_arm = jnp.swapaxes(world, 0, 1) - prints.position[None, :, :]
     swap = depth < depth.T
     deeper = jnp.where(swap[..., None], other_direction, direction), jnp.where(swap[..., None], other_arm, arm)
-    both = prints.valid[:, None] & prints.valid[None, :] & other
+    both = prints.valid[:, None] & prints.valid[None, :] & ~jnp.eye(prints.valid.size, dtype=bool)
     return jnp.where(both, jnp.maximum(depth, depth.T), -1.0), *deeper
+
+
+def _body_contacts(prints):
+    """`pair_contacts` of bodies with parts, which may pass above each other; -1 deep if all of two are far apart."""
+    shapes, (n, p) = in_world(prints), prints.parts.valid.shape
+    body = np.arange(n * p) // p
+    reach = jnp.sqrt(dot(shapes.half, shapes.half))
+    offset = shapes.position[None] - shapes.position[:, None]
+    near = dot(offset, offset) < (reach[:, None] + reach[None]) ** 2
+    near &= jnp.maximum(shapes.low[:, None], shapes.low[None]) < jnp.minimum(shapes.high[:, None], shapes.high[None])
+    near &= shapes.valid[:, None] & shapes.valid[None] & (body[:, None] != body[None])
+
+    def contact(_, shapes, pair):
+        first, second = (jax.tree.map(lambda a, k=k: a[k][None], shapes) for k in pair)
+        depth, normal, place = _corners(first, second)
+        # The reverse: a corner of the second inside a face of the first.
+        back, back_normal, back_place = _corners(second, first)
+        swap = (depth < back)[..., None]
+        deeper = jnp.maximum(depth, back), jnp.where(swap, back_normal, -normal), jnp.where(swap, back_place, place)
+        return jax.tree.map(lambda a: a[0, 0], deeper)
+
+    pairs = tuple(jnp.asarray(a.reshape(-1)) for a in np.indices(near.shape))
+    contacts = masked_vmap(contact, near.reshape(-1), None, shapes, pairs, block=64)
+    depth, direction, place = (
+        jnp.swapaxes(a.reshape(n, p, n, p, *a.shape[1:]), 1, 2).reshape(n, n, p * p, *a.shape[1:]) for a in contacts
+    )
+    apart = ~jnp.swapaxes(near.reshape(n, p, n, p), 1, 2).reshape(n, n, p * p)
+    depth, direction, place = _deepest_of(jnp.where(apart, -1.0, depth), direction, place)
+    return depth, direction, place - prints.position[None]
+
+
+def _deepest_of(depth, *vectors):
+    """The deepest of contacts along the last axis of `depth`, (..., K): its depth, and its vectors, (..., K, 2)."""
+    i = jnp.argmax(depth, axis=-1)[..., None]
+    chosen = (jnp.take_along_axis(v, i[..., None], axis=-2)[..., 0, :] for v in vectors)
+    return jnp.take_along_axis(depth, i, axis=-1)[..., 0], *chosen
+
+
+def _corners(prints, others):
+    """Of each footprint's outline in each other footprint: the largest depth, the other's outward normal there, and the
+    place; in the world."""
+    outline = outline_points(prints)
+    into = turned(-others.yaw[None, :, None], outline[:, None] - others.position[None, :, None, :])
+    depth, point = deepest(point_depth(others.half[None, :, None, :], others.round[None, :, None], into), into)
+    yaw = jnp.broadcast_to(others.yaw[None, :], depth.shape)
+    normal = turned(yaw, point_normal(others.half[None], others.round[None], point))
+    return depth, normal, turned(yaw, point) + others.position[None]
 
 
 def wall_depth(shelf, prints):

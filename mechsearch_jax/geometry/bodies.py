@@ -16,13 +16,13 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import EDGE_EXPONENT, Superquadrics
-from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform
+from mechsearch_jax.geometry.transforms import matmul, rotate
 
 # Largest number of parts of a body.
 PARTS = 4
-# Points on each part that decide how round the superquadric is that bounds a body, and the largest gauge of a point
+# Points on a body that decide how round the superquadric is that bounds a body, and the largest gauge of a point
 # that counts as bounded. A rim is rounded in proportion to a cylinder's height: shorter ones' stick out a little.
-BOUNDED_POINTS, BOUNDED, RIM = 128, 1.01, 1.08
+BOUNDED_POINTS, BOUNDED, RIM = 512, 1.01, 1.08
 # Largest ratio of the first two half-extents of a body of several parts that counts as round.
 ROUND = 1.05
 
@@ -61,6 +61,17 @@ def any_part(scene: Superquadrics, values: Bool[Array, "*batch parts"]) -> Bool[
     return jnp.any(values.reshape(*values.shape[:-1], scene.capacity, scene.parts.capacity), axis=-1)
 
 
+def boxed(scene: Superquadrics) -> Superquadrics:
+    """Bodies, which must have parts, without these, and with the half-extents of boxes about their origins that contain
+    them: larger than their own, if the bodies are `enlarged` and their parts grow along other axes."""
+    parts = scene.parts
+    assert parts is not None
+    reach = jnp.abs(parts.position) + superquadric.support(
+        parts.size[..., None, :], parts.exponents[..., None, :], parts.rotation
+    )
+    return scene.replace(size=jnp.max(jnp.where(parts.valid[..., None], reach, 0.0), axis=-2), parts=None)
+
+
 def enlarged(scene: Superquadrics, by: Array | float) -> Superquadrics:
     """The bodies with all half-extents larger [m]."""
     parts = None if scene.parts is None else enlarged(scene.parts, by)
@@ -73,31 +84,36 @@ def slimmed(scene: Superquadrics, by: Array | float, least: float) -> Superquadr
     return scene.replace(size=jnp.maximum(scene.size - by, least * scene.size), parts=parts)
 
 
-def surfaces(scene: Superquadrics, count: int) -> Float[Array, "n points 3"]:
-    """Points on the surface of every body in its own frame [m], `count` on each of its parts."""
+def surfaces(scene: Superquadrics, count: int) -> Float[Array, "n count 3"]:
+    """`count` points on the surface of every body in its own frame [m], which its parts share."""
     if scene.parts is None:
         return superquadric.sample_surface(scene.size, scene.exponents, count)
     return _parts_surface(scene.parts, count)
 
 
-def surface_of(scene: Superquadrics, index: Int[Array, ""], count: int) -> Float[Array, "points 3"]:
+def surface_of(scene: Superquadrics, index: Int[Array, ""], count: int) -> Float[Array, "count 3"]:
     """The points of `surfaces` on one body."""
     if scene.parts is None:
         return superquadric.sample_surface(scene.size[index], scene.exponents[index], count)
     return _parts_surface(jax.tree.map(lambda a: a[index], scene.parts), count)
 
 
-def _parts_surface(parts: Superquadrics, count: int) -> Float[Array, "*batch points 3"]:
-    """Points on parts in their body's frame [m]; those of absent parts repeat those of the first that there is."""
-    first = jnp.argmax(parts.valid, axis=-1)
-    which = jnp.where(parts.valid, jnp.arange(parts.capacity).reshape(*[1] * first.ndim, -1), first[..., None])
-    parts = jax.tree.map(lambda a: _along(a, which), parts)
-    points = superquadric.sample_surface(parts.size, parts.exponents, count)
-    points = transform(make(parts.rotation, parts.position)[..., None, :, :], points)
-    return points.reshape(*points.shape[:-3], -1, 3)
+def _parts_surface(parts: Superquadrics, count: int) -> Float[Array, "*batch count 3"]:
+    """Points on parts in their body's frame [m]: directions spread over the sphere, which the parts that there are take
+    in turns, the largest first. So equal parts have the points of one."""
+    lead = parts.valid.ndim - 1
+    volume = jnp.where(parts.valid, jnp.prod(parts.size, axis=-1), -1.0)
+    largest_first = jnp.argsort(-volume, axis=-1, stable=True)
+    number = jnp.maximum(jnp.sum(parts.valid, axis=-1, keepdims=True), 1)
+    turn = jnp.arange(count).reshape(*[1] * lead, count) % number
+    owner = jnp.take_along_axis(largest_first, turn, axis=-1)
+    own = jax.tree.map(lambda a: _along(a, owner), parts)
+    directions = jnp.asarray(superquadric.surface_directions(count)).reshape(*[1] * lead, count, 3)
+    points = superquadric.towards(own.size, own.exponents, jnp.broadcast_to(directions, own.size.shape))
+    return rotate(own.rotation, points) + own.position
 
 
-def _along(array: Shaped[Array, "*batch p _*rest"], index: Int[Array, "*batch p"]) -> Shaped[Array, "*batch p _*rest"]:
+def _along(array: Shaped[Array, "*batch p *rest"], index: Int[Array, "*batch k"]) -> Shaped[Array, "*batch k *rest"]:
     """Entries along the axis of the parts."""
     wide = index.reshape(*index.shape, *[1] * (array.ndim - index.ndim))
     return jnp.take_along_axis(array, wide, axis=index.ndim - 1)

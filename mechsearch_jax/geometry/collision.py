@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int, Integer, UInt8
 
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.bodies import any_part, per_part, world_parts
+from mechsearch_jax.geometry.bodies import any_part, boxed, per_part, world_parts
 from mechsearch_jax.geometry.collision_kernel import collide, uses_kernel
 from mechsearch_jax.geometry.masked import block_size, entry_of, for_each, merged, put, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -29,6 +28,10 @@ from mechsearch_jax.geometry.transforms import inverse, make, matmul
 
 # Pairs that a CPU tests together: by boxes, by bounds, and by gauges.
 BOXES, CLOUDS, GAUGES = 1024, 128, 32
+# Pairs of a cloud and a body of several parts that a CPU tests together.
+BODIES = 512
+# Where absent parts are put, out of reach of any cloud [m].
+NOWHERE = 1e3
 # With at most so many pairs, bounds do not pay: gauges decide at once.
 FEW = 1024
 # State of a pair: apart, undecided, or colliding.
@@ -85,18 +88,27 @@ def collisions(
       True where a masked pair collides.
     """
     parts = world_parts(scene)
-    T_object_world = inverse(make(parts.rotation, parts.position))[:, :3].reshape(-1, 12)
-    objects = jnp.concatenate([T_object_world, parts.size, parts.exponents], axis=1)
+    if scene.parts is not None:
+        parts = parts.replace(position=jnp.where(parts.valid[:, None], parts.position, NOWHERE))
+    objects = _numbers(parts)
     boxes = jnp.stack([clouds.low, clouds.high], axis=1)
     table = (clouds.points, boxes, clouds.gap)
     rows = (jnp.asarray(cloud, jnp.uint32), T_world_cloud, objects, table[:2] if own else None)
-    hits = merged(functools.partial(_collide, clouds.first))(_of_parts(scene, mask), None if own else table, rows)
-    return any_part(scene, hits)
+    if scene.parts is None:
+        return merged(functools.partial(_collide, clouds.first))(mask, None if own else table, rows)
+    if uses_kernel():
+        of_parts = per_part(scene, mask) & scene.parts.valid.reshape(1, -1)
+        hits = merged(functools.partial(_collide, clouds.first))(of_parts, None if own else table, rows)
+        return any_part(scene, hits)
+    run = functools.partial(_collide_bodies, clouds.first, scene.parts.capacity)
+    rows = (_numbers(boxed(scene)), *rows)
+    return merged(run, indices=scene.parts.capacity)(mask, None if own else table, rows)
 
 
-def _of_parts(scene: Superquadrics, mask: Bool[Array, "m n"]) -> Bool[Array, "m parts"]:
-    """The mask of `world_parts`, without those that are absent."""
-    return mask if scene.parts is None else per_part(scene, mask) & scene.parts.valid.reshape(1, -1)
+def _numbers(scene: Superquadrics) -> Float[Array, "n 17"]:
+    """`T_object_world`, half-extents and exponents of superquadrics."""
+    T_object_world = inverse(make(scene.rotation, scene.position))[:, :3].reshape(-1, 12)
+    return jnp.concatenate([T_object_world, scene.size, scene.exponents], axis=1)
 
 
 def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple) -> Array:
@@ -120,6 +132,35 @@ def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, 
         state = pairs.decided(state, _bounded, CLOUDS)
     state = pairs.decided(state, _gauged, GAUGES)
     return (state == HIT).reshape(mask.shape)
+
+
+def _collide_bodies(
+    first: int, parts: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple
+) -> Array:
+    """`collisions` of bodies with `parts` parts each on a CPU, with leading batch axes.
+
+    Few bodies are near a cloud, and few of their parts: a table of all clouds and parts would take longer to look
+    through than to test.
+    """
+    boxes, cloud, T_world_cloud, objects, own = rows
+    if mask.size == 0:
+        return mask
+    bodies = _AllPairs(mask.shape, shared, cloud, T_world_cloud, boxes, own)
+    pairs = _AllPairs((*mask.shape[:-1], mask.shape[-1] * parts), shared, cloud, T_world_cloud, objects, own)
+    state = jnp.where(mask.reshape(-1), OPEN, APART)
+    state = bodies.decided(state, _near, BOXES)
+    tests = [(_bounded, CLOUDS), (_gauged, GAUGES)]
+    tests = [(functools.partial(_bounded, count=first), CLOUDS), *tests] if first else tests
+
+    def body(state, index, active):
+        pair = jax.lax.min(index, jnp.uint32(len(state) - 1))
+        each = (pair[:, None] * jnp.uint32(parts) + jnp.arange(parts, dtype=jnp.uint32)[None]).reshape(-1)
+        of_parts = jnp.where(jnp.repeat(active, parts), _near(pairs.at(each)), APART)
+        for test, block in tests:
+            of_parts = pairs.decided(of_parts, test, block, each)
+        return put(state, index, jnp.max(of_parts.reshape(-1, parts), axis=1))
+
+    return (for_each(state == OPEN, body, state, block_size(BODIES, len(state))) == HIT).reshape(mask.shape)
 
 
 class _Pairs(NamedTuple):
@@ -164,16 +205,20 @@ class _AllPairs:
     objects: Array
     own: tuple | None
 
-    def decided(self, state: UInt8[Array, " all"], test: Callable[[_Pairs], Array], block: int) -> UInt8[Array, " all"]:
-        """The states of the pairs after a test of the undecided ones."""
-        last = jnp.uint32(math.prod(self.shape) - 1)
+    def decided(
+        self, state: UInt8[Array, " some"], test: Callable[[_Pairs], Array], block: int, which: Array | None = None
+    ) -> UInt8[Array, " some"]:
+        """The states of the pairs after a test of the undecided ones; `which` has their numbers if they are not all."""
+        last = jnp.uint32(len(state) - 1)
 
         def body(state, index, active):
-            return put(state, index, test(self._at(jax.lax.min(index, last))))
+            number = jax.lax.min(index, last)
+            return put(state, index, test(self.at(number if which is None else taken(which, number))))
 
         return for_each(state == OPEN, body, state, block_size(block, len(state)))
 
-    def _at(self, index: Integer[Array, " k"]) -> _Pairs:
+    def at(self, index: Integer[Array, " k"]) -> _Pairs:
+        """The pairs of these numbers."""
         batch, (m, n) = self.shape[:-2], self.shape[-2:]
         entry, width = entry_of(index, batch, m * n), jnp.uint32(n)
         j = jax.lax.rem(index, width)

@@ -190,3 +190,11 @@ def sample_surface(
     cube = cube.reshape(*[1] * (size.ndim - 1), count, 3)
     points = cube * size[..., None, :]
     return points / gauge(size[..., None, :], exponents[..., None, :], points)[..., None]
+
+
+def towards(
+    size: Float[Array, "*batch 3"], exponents: Float[Array, "*batch 2"], directions: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 3"]:
+    """The point of `sample_surface` on each superquadric for one direction of its own, in its frame [m]."""
+    points = directions / jnp.max(jnp.abs(directions), axis=-1, keepdims=True) * size
+    return points / gauge(size, exponents, points)[..., None]

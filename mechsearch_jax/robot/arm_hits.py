@@ -7,7 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.bodies import any_part, world_parts
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
+from mechsearch_jax.geometry.transforms import inverse, make, transform
 from mechsearch_jax.robot.gripper import arm_points
 
 # Exponent that a superquadric grown by a sphere tends to; a little below an ellipsoid's, so that the grown superquadric
@@ -38,13 +40,26 @@ def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bo
       count: spheres for each capsule, see `arm_points`.
     """
     points, radius = arm_points(q, count)
-    parts = world_parts(scene)
-    n = parts.capacity
+    if scene.parts is not None:
+        parts = world_parts(scene)
+        # Most parts are absent.
+        near = masked_vmap(_touches, parts.valid, None, (points, radius), parts, block=16)
+        return any_part(scene, near.T)
+    n = scene.capacity
     radii = jnp.broadcast_to(radius[:, None], (radius.shape[0], n))
     size, exponents = grown(
-        jnp.broadcast_to(parts.size[None], (*radii.shape, 3)),
-        jnp.broadcast_to(parts.exponents[None], (*radii.shape, 2)),
+        jnp.broadcast_to(scene.size[None], (*radii.shape, 3)),
+        jnp.broadcast_to(scene.exponents[None], (*radii.shape, 2)),
         radii,
     )
-    near = gauge(size[None], exponents[None], to_object_frame(parts, points)) < 1.0
-    return any_part(scene, jnp.any(near, axis=1) & parts.valid[None])
+    near = gauge(size[None], exponents[None], to_object_frame(scene, points)) < 1.0
+    return jnp.any(near, axis=1) & scene.valid[None]
+
+
+def _touches(_, arm: tuple[Float[Array, "w s 3"], Float[Array, " s"]], part: Superquadrics) -> Bool[Array, " w"]:
+    """Whether spheres, given by centres in each of w configurations and radii, touch a part, without its axis [m]."""
+    points, radius = arm
+    size, exponents = (jnp.broadcast_to(a[None], (*radius.shape, a.shape[-1])) for a in (part.size, part.exponents))
+    size, exponents = grown(size, exponents, radius)
+    local = transform(inverse(make(part.rotation, part.position)), points)
+    return jnp.any(gauge(size[None], exponents[None], local) < 1.0, axis=1)
