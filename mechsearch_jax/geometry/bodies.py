@@ -113,8 +113,8 @@ def _parts_surface(parts: Superquadrics, count: int) -> Float[Array, "*batch cou
     return rotate(own.rotation, points) + own.position
 
 
-def _along(array: Shaped[Array, "*batch p *rest"], index: Int[Array, "*batch k"]) -> Shaped[Array, "*batch k *rest"]:
-    """Entries along the axis of the parts."""
+def _along(array: Shaped[Array, "..."], index: Int[Array, "*batch k"]) -> Shaped[Array, "..."]:
+    """Entries of an array (*batch, P, ...) along the axis of the parts."""
     wide = index.reshape(*index.shape, *[1] * (array.ndim - index.ndim))
     return jnp.take_along_axis(array, wide, axis=index.ndim - 1)
 
