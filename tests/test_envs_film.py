@@ -23,9 +23,18 @@ from mechsearch_jax.envs.recording.recording import (
 )
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, TARGET
+from mechsearch_jax.geometry.bodies import with_parts
 from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.movie import save_movie
+
+
+def of_parts(step):
+    scenes = {name: jax.tree.map(np.asarray, with_parts(getattr(step, name))) for name in ("scene", "after")}
+    return dataclasses.replace(step, **scenes)
+
+
+OF_PARTS = dataclasses.replace(RECORDING, steps=tuple(map(of_parts, RECORDING.steps)))
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +42,14 @@ def played():
     return playback(RECORDING, 25)
 
 
-def test_a_recording_comes_back_as_it_was_written(tmp_path):
-    save_recording(RECORDING, tmp_path / NAME)
+@pytest.mark.parametrize("recording", [RECORDING, OF_PARTS], ids=["bodies", "bodies of parts"])
+def test_a_recording_comes_back_as_it_was_written(recording, tmp_path):
+    save_recording(recording, tmp_path / NAME)
     assert (tmp_path / NAME).stat().st_size < 30_000
     again = load_recording(tmp_path / NAME)
     for name in ("heading", "camera", "shelf", "target"):
-        assert getattr(again, name) == getattr(RECORDING, name)
-    for one, other in zip(again.steps, RECORDING.steps, strict=True):
+        assert getattr(again, name) == getattr(recording, name)
+    for one, other in zip(again.steps, recording.steps, strict=True):
         assert (one.title, one.caption, one.found) == (other.title, other.caption, other.found)
         assert (one.action is None) == (other.action is None)
         for name in ("world", "scene", "after", "existence", "graspability", "target_pose", "action"):

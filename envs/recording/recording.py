@@ -26,6 +26,7 @@ from mechsearch_jax.envs.simulators.simulator import ARM
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, World
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.runtime.arrays import read_arrays
@@ -50,6 +51,8 @@ _SETTINGS: dict[str, type] = {"camera": Camera, "shelf": Shelf, "target": Target
 _TEXTS = ("title", "caption", "found")
 _ARRAYS = ("existence", "graspability", "target_pose")
 _TREES: dict[str, type] = {"world": World, "scene": Superquadrics, "after": Superquadrics, "action": Action}
+# Those whose bodies may have parts.
+_WITH_PARTS = ("scene", "after")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -186,6 +189,11 @@ def save_recording(recording: Recording, path: PathLike) -> None:
         trees = [getattr(step, name) or jax.device_get(no_action()) for step in steps]
         for field in _fields(kind):
             arrays[f"{name}.{field}"] = np.stack([np.asarray(getattr(tree, field)) for tree in trees])
+    for name in _WITH_PARTS:
+        parts = [getattr(step, name).parts for step in steps]
+        if parts[0] is not None:
+            for field in _fields(Superquadrics):
+                arrays[f"{name}.parts.{field}"] = np.stack([np.asarray(getattr(each, field)) for each in parts])
     arrays |= {name: np.stack([np.asarray(getattr(step, name)) for step in steps]) for name in _ARRAYS}
     arrays |= packed([step.sampled for step in steps])
     arrays |= packed_evidence([step.evidence for step in steps], arrays["existence"].shape[1])
@@ -231,6 +239,10 @@ def _check(arrays: dict[str, np.ndarray], count: int, poses: int) -> None:
     examples = {
         f"{name}.{f}": np.asarray(getattr(tree, f)) for name, tree in trees.items() for f in _fields(type(tree))
     }
+    for name in _WITH_PARTS:
+        if f"{name}.parts.size" in arrays:
+            parts = superquadric.empty(MAX_OBJECTS, min(arrays[f"{name}.parts.size"].shape[2], PARTS)).parts
+            examples |= {f"{name}.parts.{f}": np.asarray(getattr(parts, f)) for f in _fields(Superquadrics)}
     examples |= {"rows": np.array(0), "acts": np.array(True), "target_pose": np.zeros(3)}
     examples |= {"existence": np.zeros(poses, bool), "graspability": np.zeros(poses, int)}
     if not count or any(arrays[name].shape != (count, *example.shape) for name, example in examples.items()):
@@ -259,12 +271,17 @@ def _no_world() -> World:
 def _step(arrays: dict[str, np.ndarray], texts: dict[str, Any], i: int, rows: slice) -> RecordedStep:
     trees = {name: kind(*(arrays[f"{name}.{f}"][i] for f in _fields(kind))) for name, kind in _TREES.items()}
     trees["action"] = trees["action"] if arrays["acts"][i] else None
+    for name in _WITH_PARTS:
+        if f"{name}.parts.size" in arrays:
+            parts = (arrays[f"{name}.parts.{f}"][i] for f in _fields(Superquadrics))
+            trees[name] = trees[name].replace(parts=Superquadrics(*parts))  # pyright: ignore[reportArgumentType]
     trace = Trace(*(arrays[f"trace.{name}"][rows] for name in _fields(Trace)))
     return RecordedStep(**{n: texts[n] for n in _TEXTS}, **{n: arrays[n][i] for n in _ARRAYS}, **trees, trace=trace)
 
 
 def _fields(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))
+    """The names of the arrays of a pytree; parts of bodies are kept beside them."""
+    return tuple(field.name for field in dataclasses.fields(kind) if field.name != "parts")
 
 
 def _tuples(value: Any) -> Any:
