@@ -16,9 +16,9 @@ from mechsearch_jax.envs.recording.recording import NAME, save_recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes import Capsule
 from mechsearch_jax.viz import web
 from mechsearch_jax.viz.panda import panda_pieces, panda_solids
-from mechsearch_jax.viz.raycast import Capsule
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FPS = 10

@@ -11,9 +11,9 @@ from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME
-from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.shapes import Capsule, in_order, shape_of
 from mechsearch_jax.viz.panda import GREY, panda_solids
-from mechsearch_jax.viz.raycast import RAYS, Capsule, Eye, Solid
+from mechsearch_jax.viz.raycast import RAYS, Eye, Solid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -137,7 +137,7 @@ def _set(value, path, new):
     ("path", "new", "message"),
     [
         (("format",), "other", 'format: "other" is not "mechsearch-scenario"'),
-        (("version",), 2, "version: 2 is not supported; this program reads 1"),
+        (("version",), 3, "version: 3 is not supported; this program reads 1 and 2"),
         (("version",), True, "version: true is not supported"),
         (("name",), "", "name: must be a text"),
         (("colour",), "red", 'unknown key "colour"'),

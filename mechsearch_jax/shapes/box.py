@@ -51,6 +51,9 @@ class Box:
         x, y, z = (half_size[..., i] for i in range(3))
         return library.sqrt(x**2 + y**2 + z**2)
 
+    def inside(self, point, half_size, library):
+        return library.all(library.abs(point) <= half_size, axis=-1)
+
     def reach(self, direction, half_size, library):
         return library.sum(library.abs(direction) * half_size, axis=-1)
 

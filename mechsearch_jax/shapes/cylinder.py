@@ -55,6 +55,10 @@ class Cylinder:
     def bounding_radius(self, half_size, library):
         return library.sqrt(half_size[..., 0] ** 2 + half_size[..., 2] ** 2)
 
+    def inside(self, point, half_size, library):
+        across = point[..., 0] ** 2 + point[..., 1] ** 2 <= half_size[0] ** 2
+        return across & (library.abs(point[..., 2]) <= half_size[2])
+
     def reach(self, direction, half_size, library):
         square = 1.0 - direction[..., 2] ** 2
         tilted = square > 1e-12

@@ -1,4 +1,7 @@
-"""The registry of shapes. A new shape is a new file in this folder and an entry here."""
+"""The registries of shapes, of which whole bodies and targets may be, and of primitives, which pieces of compounds are.
+
+A new one is a new file in this folder and an entry here.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,17 @@ from typing import Any
 
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.shapes.box import Box
+from mechsearch_jax.shapes.capsule import Capsule
 from mechsearch_jax.shapes.cylinder import Cylinder
+from mechsearch_jax.shapes.ellipsoid import Ellipsoid
+from mechsearch_jax.shapes.primitive import Primitive
 from mechsearch_jax.shapes.shape import Shape
 
 SHAPES: Mapping[str, Shape] = {shape.name: shape for shape in (Box(), Cylinder())}
+# In the order of their codes.
+PRIMITIVES: Mapping[str, Primitive] = {
+    primitive.name: primitive for primitive in (Box(), Cylinder(), Ellipsoid(), Capsule())
+}
 
 
 def shape_of(name: Any, where: str = "shape") -> Shape:

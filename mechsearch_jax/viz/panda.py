@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from mechsearch_jax.robot.arm_clearance import FOOT
 from mechsearch_jax.robot.gripper import HAND, LINKS, Primitive, fingers
-from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.viz.raycast import Capsule, Colour, Solid
+from mechsearch_jax.shapes import Capsule, shape_of
+from mechsearch_jax.viz.raycast import Colour, Solid
 
 WHITE, GREY, DARK = (0.93, 0.94, 0.95), (0.62, 0.65, 0.69), (0.27, 0.30, 0.34)
 # Colours of links 1 to 7.

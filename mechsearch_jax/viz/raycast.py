@@ -42,43 +42,6 @@ class Surface(Protocol):
     def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh: ...
 
 
-@dataclasses.dataclass(frozen=True)
-class Capsule:
-    """A `Surface`: a cylinder about its third axis with round ends; half-extents (r, r, half its length)."""
-
-    def cut(self, origin, direction, half_size, library):
-        """The nearest crossing of the side, between the centres of the ends, or of the spheres at the ends."""
-        (x, y, z), (u, v, w) = origin, direction
-        radius, half = half_size[0], half_size[2] - half_size[0]
-        square = library.maximum(u * u + v * v, 1e-12)
-        along = u * x + v * y
-        chord = along * along - square * (x * x + y * y - radius * radius)
-        side = (-along - library.sqrt(library.maximum(chord, 0.0))) / square
-        on_side = (chord >= 0.0) & (library.abs(z + side * w) <= half) & (side > 0.0)
-        nearest = library.where(on_side, side, library.inf)
-        length = square + w * w
-        for end in (-half, half):
-            along = u * x + v * y + w * (z - end)
-            chord = along * along - length * (x * x + y * y + (z - end) ** 2 - radius * radius)
-            first = (-along - library.sqrt(library.maximum(chord, 0.0))) / length
-            hit = (chord >= 0.0) & (first > 0.0)
-            nearest = library.where(hit & (first < nearest), first, nearest)
-        return nearest
-
-    def normal(self, point, half_size, library):
-        half = half_size[..., 2:] - half_size[..., :1]
-        height = point[..., 2:] - library.clip(point[..., 2:], -half, half)
-        return library.concatenate([point[..., :2], height], axis=-1)
-
-    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
-        """Its surface as a triangle mesh [m]."""
-        import trimesh
-
-        radius, _, half = half_size
-        mesh = trimesh.creation.capsule(height=2 * (half - radius), radius=radius, count=(16, 12))
-        return mesh.apply_translation(-mesh.bounds.mean(axis=0))
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solid:
     """A visible solid.

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import importlib.resources
 import json
-import math
 import os
 import re
 from collections.abc import Sequence
@@ -22,11 +21,15 @@ from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import read_json, replacing
-from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.shapes import SHAPES, shape_of
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, centred, half_extents
+from mechsearch_jax.workspace.compound_file import format_compound, is_compound, parse_compound
+from mechsearch_jax.workspace.json_checks import check_keys, check_norm, numbers
 from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-scenario"
-VERSION = 1
+# Version 2 has bodies of several pieces; what needs none is written as version 1.
+VERSION, COMPOUND_VERSION = 1, 2
 MAX_OBJECTS = 8
 # Enough for thousands of scenes: 48 bits.
 HASH_DIGITS = 12
@@ -35,7 +38,8 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 # Smallest half-extent; smaller ones lead to numerical problems [m].
 LEAST_HALF_SIZE = 5e-4
 
-_BODY_KEYS = {"shape": str, "half_size": 3, "position": 3, "quaternion": 4}
+_POSE_KEYS = ("position", "quaternion")
+_BODY_KEYS = ("shape", "half_size", *_POSE_KEYS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,16 +47,19 @@ class Body:
     """A rigid body on the shelf.
 
     Attributes:
-      shape: name of its shape, such as "box" or "cylinder".
-      half_size: half-extents along its axes [m]; for a cylinder (radius, radius, half its height).
-      position: of its centre in the world [m].
+      shape: name of its shape, such as "box" or "cylinder"; "compound" of a body of several pieces.
+      half_size: half-extents along its axes [m]; for a cylinder (radius, radius, half its height), for a compound those
+        of the smallest box about its centre of mass.
+      position: of its centre in the world [m]; of a compound its centre of mass.
       quaternion: (w, x, y, z) of its rotation in the world, a unit quaternion.
+      compound: what a compound is made of; None for any other body.
     """
 
     shape: str
     half_size: tuple[float, float, float]
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
+    compound: Compound | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,12 +83,24 @@ class Scenario:
         The name and the format of numbers in the file do not count. The order of the objects does, since random numbers
         depend on it.
         """
-        # Adding 0 makes -0 the 0 that it equals.
-        bodies = [
-            [body.shape, *([float(v) + 0.0 for v in part] for part in (body.half_size, body.position, body.quaternion))]
-            for body in (*self.objects, self.target)
-        ]
+        bodies = [_content(body) for body in (*self.objects, self.target)]
         return hashlib.sha256(json.dumps(bodies, allow_nan=False).encode()).hexdigest()[:HASH_DIGITS]
+
+
+def _content(body: Body) -> list[Any]:
+    """Shape, size and pose of a body; of a compound all that it is made of."""
+    if body.compound is None:
+        return [body.shape, *(_plain(part) for part in (body.half_size, body.position, body.quaternion))]
+    return [body.shape, *(_plain(part) for part in (format_compound(body.compound), body.position, body.quaternion))]
+
+
+def _plain(value: Any) -> Any:
+    """A value of JSON with floating-point numbers alone; adding 0 makes -0 the 0 that it equals."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, str) else float(value) + 0.0
 
 
 def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
@@ -102,82 +121,102 @@ def check_name(value: Any, where: str) -> None:
         )
 
 
-def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
-    number = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    if not number or len(value) != count:
-        raise InputError(f"{where}: must be a list of {count} numbers")
-    try:
-        numbers = tuple(float(v) for v in value)
-    except OverflowError:
-        raise InputError(f"{where}: holds a number that is too large; every number must be finite") from None
-    if not all(math.isfinite(v) for v in numbers):
-        raise InputError(f"{where}: holds NaN or an infinite number; every number must be finite")
-    return numbers
-
-
-def _check_keys(value: Any, keys: Sequence[str], where: str, key: str | None) -> None:
-    place = where if key is None else f"{where}: {key}"
-    if not isinstance(value, dict):
-        raise InputError(f"{place}: must be a JSON object with the keys {', '.join(keys)}")
-    for unknown in [k for k in value if k not in keys]:
-        raise InputError(f"{place}: unknown key {shown(unknown)}; known are {', '.join(keys)}")
-    for missing in [k for k in keys if k not in value]:
-        raise InputError(f'{place}: key "{missing}" is missing')
-
-
 def _body(value: Any, where: str, key: str, shelf: Shelf) -> Body:
-    _check_keys(value, tuple(_BODY_KEYS), where, key)
+    check_keys(value, _BODY_KEYS, f"{where}: {key}")
     where = f"{where}: {key}"
     shape = shape_of(value["shape"], f"{where}.shape")
-    half_size = _numbers(value["half_size"], 3, f"{where}.half_size")
-    position = _numbers(value["position"], 3, f"{where}.position")
-    quaternion = _numbers(value["quaternion"], 4, f"{where}.quaternion")
+    half_size = numbers(value["half_size"], 3, f"{where}.half_size")
+    position, quaternion = _pose(value, where)
     if min(half_size) <= 0:
         raise InputError(f"{where}.half_size: {list(half_size)} must be positive lengths in metres")
     if fault := shape.fault(half_size):
         raise InputError(f"{where}.half_size: {fault}")
-    ranges = ((shelf.front, shelf.back), (shelf.right, shelf.left), (shelf.board, shelf.ceiling))
-    widest = max(high - low for low, high in ranges)
+    _check_size(half_size, f"{where}.half_size", shelf)
+    check_norm(quaternion, f"{where}.quaternion")
+    _check_place(position, where, shelf)
+    return Body(shape.name, half_size, position, quaternion)  # pyright: ignore[reportArgumentType]
+
+
+def _compound_body(value: Any, where: str, key: str, shelf: Shelf, folder: Path) -> Body:
+    """A body of several pieces, in the frame of its centre of mass."""
+    where = f"{where}: {key}"
+    compound, centre = centred(parse_compound(value, _POSE_KEYS, where, folder))
+    position, quaternion = _pose(value, where)
+    check_norm(quaternion, f"{where}.quaternion")
+    half_size = half_extents(compound)
+    _check_size(half_size, where, shelf)
+    if centre.any():
+        moved = rotation_matrix(quaternion) @ centre + position
+        position = tuple(round(float(p), 9) for p in moved)
+    _check_place(position, where, shelf)
+    return Body(COMPOUND, half_size, position, quaternion, compound)  # pyright: ignore[reportArgumentType]
+
+
+def _pose(value: Any, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return numbers(value["position"], 3, f"{where}.position"), numbers(value["quaternion"], 4, f"{where}.quaternion")
+
+
+def _ranges(shelf: Shelf) -> tuple[tuple[float, float], ...]:
+    return (shelf.front, shelf.back), (shelf.right, shelf.left), (shelf.board, shelf.ceiling)
+
+
+def _check_size(half_size: tuple[float, ...], where: str, shelf: Shelf) -> None:
+    widest = max(high - low for low, high in _ranges(shelf))
     if not all(LEAST_HALF_SIZE <= half <= widest for half in half_size):
         raise InputError(
-            f"{where}.half_size: {list(half_size)} must be from {LEAST_HALF_SIZE} to {widest:g}, in metres, which no"
+            f"{where}: {list(half_size)} must be from {LEAST_HALF_SIZE} to {widest:g}, in metres, which no"
             " object on this shelf exceeds"
         )
-    if abs(math.hypot(*quaternion) - 1.0) > 1e-3:
-        raise InputError(f"{where}.quaternion: its norm is {math.hypot(*quaternion):.4g}; it must be 1 (w, x, y, z)")
-    for axis, p, (low, high) in zip("xyz", position, ranges, strict=True):
+
+
+def _check_place(position: tuple[float, ...], where: str, shelf: Shelf) -> None:
+    for axis, p, (low, high) in zip("xyz", position, _ranges(shelf), strict=True):
         if not low <= p <= high:
             raise InputError(
                 f"{where}.position: {axis} = {p:g} is off the board, which reaches from {low:g} to {high:g}"
             )
-    return Body(shape.name, half_size, position, quaternion)  # pyright: ignore[reportArgumentType]
 
 
-def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenario:
+def parse_scenario(value: Any, where: str, shelf: Shelf | None = None, folder: Path | None = None) -> Scenario:
     """A scenario from parsed JSON.
 
     Args:
       value: the parsed file.
       where: how messages name the file.
       shelf: the shelf that the bodies must stand on; the default shelf if None.
+      folder: from which paths of meshes count; the working folder if None.
 
     Raises:
       InputError: the format or version is another one; a key is unknown or missing; the name is invalid; a number is
-        not finite; a size is out of range; a quaternion is not of unit length; a body is off the board.
+        not finite; a size is out of range; a quaternion is not of unit length; a body is off the board; a mesh cannot
+        be used.
     """
     shelf = shelf or Shelf()
-    _check_keys(value, ("format", "version", "name", "objects", "target"), where, None)
+    check_keys(value, ("format", "version", "name", "objects", "target"), where)
     if value["format"] != FORMAT:
         raise InputError(f'{where}: format: {shown(value["format"])} is not "{FORMAT}"')
-    if value["version"] != VERSION or isinstance(value["version"], bool):
-        raise InputError(f"{where}: version: {shown(value['version'])} is not supported; this program reads {VERSION}")
+    if value["version"] not in (VERSION, COMPOUND_VERSION) or isinstance(value["version"], bool):
+        raise InputError(
+            f"{where}: version: {shown(value['version'])} is not supported; this program reads {VERSION} and"
+            f" {COMPOUND_VERSION}"
+        )
     check_name(value["name"], f"{where}: name")
     if not isinstance(value["objects"], list):
         raise InputError(f"{where}: objects: must be a list")
     if len(value["objects"]) > MAX_OBJECTS:
         raise InputError(f"{where}: objects: {len(value['objects'])} are too many; at most {MAX_OBJECTS} fit")
-    objects = tuple(_body(b, where, f"objects[{i}]", shelf) for i, b in enumerate(value["objects"]))
-    return Scenario(value["name"], objects, _body(value["target"], where, "target", shelf))
+
+    def body(entry: Any, key: str) -> Body:
+        if not is_compound(entry):
+            return _body(entry, where, key, shelf)
+        if value["version"] == VERSION:
+            raise InputError(f'{where}: {key}: bodies of pieces or meshes need "version": {COMPOUND_VERSION}')
+        if key == "target":
+            raise InputError(f"{where}: {key}: must have a shape, one of {', '.join(SHAPES)}; only objects have pieces")
+        return _compound_body(entry, where, key, shelf, folder or Path())
+
+    objects = tuple(body(b, f"objects[{i}]") for i, b in enumerate(value["objects"]))
+    return Scenario(value["name"], objects, body(value["target"], "target"))
 
 
 def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> Scenario:
@@ -186,7 +225,7 @@ def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> S
     Raises:
       InputError: the file cannot be read, is not JSON, or fails a check of `parse_scenario`.
     """
-    return parse_scenario(read_json(path), str(path), shelf)
+    return parse_scenario(read_json(path), str(path), shelf, Path(path).parent)
 
 
 def is_another_format(path: str | os.PathLike[str]) -> bool:
@@ -202,9 +241,23 @@ def is_another_format(path: str | os.PathLike[str]) -> bool:
 
 
 def format_scenario(scenario: Scenario) -> str:
-    """The text of a scenario's file."""
-    value = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(scenario)}
+    """The text of a scenario's file: of version 1, unless a body is a compound."""
+    compounds = any(body.compound for body in (*scenario.objects, scenario.target))
+    value = {
+        "format": FORMAT,
+        "version": COMPOUND_VERSION if compounds else VERSION,
+        "name": scenario.name,
+        "objects": [_format_body(body) for body in scenario.objects],
+        "target": _format_body(scenario.target),
+    }
     return json.dumps(value, indent=1, allow_nan=False) + "\n"
+
+
+def _format_body(body: Body) -> dict[str, Any]:
+    pose = {name: getattr(body, name) for name in _POSE_KEYS}
+    if body.compound is not None:
+        return format_compound(body.compound) | pose
+    return {"shape": body.shape, "half_size": body.half_size} | pose
 
 
 def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
@@ -221,17 +274,23 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
 def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superquadrics:
     """Bodies as superquadrics with the planner's exponents, at their exact poses, in `capacity` slots.
 
+    A compound is the box about its centre of mass that contains it.
+
     Raises:
       InputError: there are more bodies than slots.
     """
     exact = Superquadrics(
         size=jnp.array([b.half_size for b in bodies], jnp.float32).reshape(-1, 3),
-        exponents=jnp.array([shape_of(b.shape).exponents for b in bodies], jnp.float32).reshape(-1, 2),
+        exponents=jnp.array([shape_of(_outer_shape(b)).exponents for b in bodies], jnp.float32).reshape(-1, 2),
         position=jnp.array([b.position for b in bodies], jnp.float32).reshape(-1, 3),
         rotation=jnp.array([rotation_matrix(b.quaternion) for b in bodies], jnp.float32).reshape(-1, 3, 3),
         valid=jnp.ones(len(bodies), bool),
     )
     return superquadric.pad(exact, capacity)
+
+
+def _outer_shape(body: Body) -> str:
+    return "box" if body.compound else body.shape
 
 
 def example_scenarios() -> dict[str, Path]:

@@ -1,0 +1,117 @@
+"""Triangle meshes as convex pieces: read by `trimesh`, decomposed by `coacd` where they are not convex already."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes.compound import CONVEX, DIGITS, MOST_SOLIDS, MOST_VERTICES, Piece
+
+# Largest mesh file [bytes].
+LARGEST_FILE = 1 << 26
+# Concavity up to which a mesh counts as convex, in CoACD's measure, and the most pieces that it is cut into.
+CONCAVITY, PIECES = 0.05, 8
+# A part of a mesh whose volume is at least this share of its hull's is convex.
+CONVEX_SHARE = 0.98
+
+
+@functools.lru_cache(maxsize=64)
+def _read(path: Path, changed: int, scale: float, where: str) -> tuple[Piece, ...]:
+    """`convex_pieces` of a file that was last changed at a time [ns]."""
+    import trimesh
+
+    try:
+        loaded = trimesh.load(str(path), force="mesh", process=True)
+    # What its many readers raise is not limited.
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{where}: {path} is no mesh that can be read ({reason}); give an OBJ, STL or PLY file"
+        ) from None
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise InputError(f"{where}: {path} holds no triangles; give an OBJ, STL or PLY file of a surface")
+    loaded.apply_scale(scale)
+    if not np.isfinite(loaded.vertices).all():
+        raise InputError(f"{where}: {path} holds vertices that are not finite numbers; mend the mesh")
+    parts = loaded.split(only_watertight=False)
+    hulls = [part.vertices for part in parts if len(part.vertices) >= 4]
+    if not hulls or not all(_is_convex(part) for part in parts):
+        hulls = _decomposed(loaded, path, where)
+    return tuple(_piece(np.asarray(vertices), path, where) for vertices in hulls)
+
+
+def _is_convex(part) -> bool:
+    return bool(part.is_watertight and part.volume >= CONVEX_SHARE * part.convex_hull.volume)
+
+
+def _decomposed(mesh, path: Path, where: str) -> list[Float[np.ndarray, "n 3"]]:
+    """Vertices of convex pieces that together are about a mesh."""
+    try:
+        import coacd  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputError(
+            f"{where}: {path} is not convex, nor made of convex pieces; to cut it into such, install CoACD with:"
+            " pip install 'mechsearch-jax[objects]'"
+        ) from None
+    coacd.set_log_level("error")
+    settings = {"max_convex_hull": PIECES, "decimate": True, "max_ch_vertex": MOST_VERTICES, "seed": 0}
+    whole = coacd.Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return [vertices for vertices, _ in coacd.run_coacd(whole, threshold=CONCAVITY, **settings)]
+
+
+def _piece(vertices: Float[np.ndarray, "n 3"], path: Path, where: str) -> Piece:
+    """The convex hull of vertices, thinned to `MOST_VERTICES`, about its own centre."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        corners = vertices[ConvexHull(vertices).vertices]
+    except (QhullError, ValueError):
+        raise InputError(f"{where}: {path} has a part that is flat; give a mesh of solid parts") from None
+    corners = thinned(corners)
+    centre = np.round(corners.mean(axis=0), DIGITS)
+    rows = np.round(corners - centre, DIGITS)
+    x, y, z = centre.tolist()
+    return Piece(CONVEX, (0.0, 0.0, 0.0), (x, y, z), vertices=tuple((a, b, c) for a, b, c in rows.tolist()))
+
+
+def thinned(corners: Float[np.ndarray, "n 3"], most: int = MOST_VERTICES) -> Float[np.ndarray, "m 3"]:
+    """At most so many of the vertices of a convex polyhedron: those farthest out in evenly spread directions."""
+    if len(corners) <= most:
+        return corners
+    rows = np.arange(most) + 0.5
+    angle, height = np.pi * (1 + 5**0.5) * rows, 1 - 2 * rows / most
+    level = np.sqrt(1 - height**2)
+    directions = np.stack([level * np.cos(angle), level * np.sin(angle), height], axis=1)
+    return corners[np.unique(np.argmax(corners @ directions.T, axis=0))]
+
+
+def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
+    """The convex pieces of a mesh file, in the mesh's frame.
+
+    A mesh whose connected parts are convex is taken as it is. Any other is cut into at most `PIECES` pieces, always the
+    same; where that takes long, save the scenario: it then holds the pieces.
+
+    Args:
+      path: of the file.
+      scale: metres per unit of the file.
+      where: how messages begin.
+
+    Raises:
+      InputError: it cannot be read, is no mesh, has flat parts or too many, or `coacd` is needed and not installed.
+    """
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(
+            f"{where}: {path} cannot be read ({error.strerror}); its path counts from the scenario's folder"
+        ) from None
+    if status.st_size > LARGEST_FILE:
+        raise InputError(f"{where}: {path} is larger than {LARGEST_FILE >> 20} MiB; simplify the mesh")
+    pieces = _read(path, status.st_mtime_ns, scale, where)
+    if len(pieces) > MOST_SOLIDS:
+        raise InputError(f"{where}: {path} has {len(pieces)} separate parts; at most {MOST_SOLIDS} can be simulated")
+    return pieces

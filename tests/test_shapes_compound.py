@@ -1,0 +1,233 @@
+"""Primitives against references in float64, and compounds: solids, mass properties, superquadric parts, and meshes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes import PRIMITIVES, frustum
+from mechsearch_jax.shapes import compound as compounds
+from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
+from mechsearch_jax.shapes.meshes import convex_pieces, thinned
+from mechsearch_jax.shapes.parts import PARTS, parts_of, volume_in_common
+
+HALF = {
+    "box": (0.03, 0.02, 0.05),
+    "cylinder": (0.03, 0.03, 0.05),
+    "ellipsoid": (0.03, 0.02, 0.05),
+    "capsule": (0.03, 0.03, 0.05),
+}
+TILTED = tuple(Rotation.from_euler("xyz", [40, -25, 70], degrees=True).as_quat(scalar_first=True).tolist())
+MUG = Compound(
+    (
+        Piece("cylinder", (0.04, 0.04, 0.05), (0.0, 0.0, 0.05)),
+        Piece("box", (0.015, 0.006, 0.03), (0.05, 0.0, 0.05)),
+    ),
+    density=400.0,
+    friction=0.5,
+)
+
+
+def even(seed, half, count=200_000, stretch=1.1):
+    """Uniform points in the box around a primitive, a little larger, and the box's volume."""
+    bound = stretch * np.array(half)
+    return np.random.default_rng(seed).uniform(-bound, bound, (count, 3)), float(np.prod(2 * bound))
+
+
+def test_the_codes_of_primitives_are_their_order():
+    assert [primitive.code for primitive in PRIMITIVES.values()] == list(range(len(PRIMITIVES)))
+    assert len(PRIMITIVES) == compounds.CONVEX_CODE
+
+
+@pytest.mark.parametrize("name", PRIMITIVES)
+def test_volume_and_moments_are_those_of_the_points_inside(name):
+    primitive, half = PRIMITIVES[name], np.array(HALF[name])
+    points, box = even(0, half)
+    held = points[primitive.inside(points, half, np)]
+    assert primitive.volume(half, np) == pytest.approx(box * len(held) / len(points), rel=0.01)
+    square = (held**2).mean(axis=0)
+    np.testing.assert_allclose(primitive.moments(half, np), square.sum() - square, rtol=0.01)
+    assert np.linalg.norm(held, axis=1).max() <= primitive.bounding_radius(half, np)
+    assert np.linalg.norm(held, axis=1).max() > 0.97 * primitive.bounding_radius(half, np)
+
+
+@pytest.mark.parametrize("name", PRIMITIVES)
+def test_rays_meet_a_primitive_where_its_inside_begins(name):
+    primitive, half = PRIMITIVES[name], np.array(HALF[name])
+    rng = np.random.default_rng(1)
+    start = rng.normal(size=(300, 3))
+    start *= 0.5 / np.linalg.norm(start, axis=1, keepdims=True)
+    way = rng.uniform(-0.05, 0.05, (300, 3)) - start
+    depth = primitive.cut(list(start.T), list(way.T), half, np)
+    along = np.linspace(0.0, 1.5, 3001)
+    held = primitive.inside(start[:, None] + along[:, None] * way[:, None], half, np)
+    first = np.where(held.any(axis=1), along[held.argmax(axis=1)], np.inf)
+    hit = np.isfinite(depth)
+    assert hit.sum() > 100
+    # A sliver thinner than a sample is hit by the ray alone.
+    assert np.all(np.isfinite(first) <= hit)
+    both = np.isfinite(first)
+    assert np.all(depth[both] <= first[both] + 1e-9)
+    assert np.quantile(first[both] - depth[both], 0.95) < 6e-4
+    near = start[hit] + depth[hit][:, None] * way[hit]
+    normal = primitive.normal(near, np.broadcast_to(half, near.shape), np)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    assert not primitive.inside(near + 1e-6 * normal, half, np).any()
+    assert primitive.inside(near - 1e-6 * normal, half, np).all()
+
+
+@pytest.mark.parametrize("name", PRIMITIVES)
+def test_meshes_of_primitives_have_their_volume(name):
+    primitive, half = PRIMITIVES[name], HALF[name]
+    mesh = primitive.mesh(half)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(primitive.volume(np.array(half), np), rel=0.03)
+    np.testing.assert_allclose(mesh.bounds, [-np.array(half), half], atol=0.02 * max(half))
+
+
+def test_what_a_capsule_cannot_be_is_said():
+    assert "equal" in PRIMITIVES["capsule"].fault((0.02, 0.03, 0.05))
+    assert "at least its radius" in PRIMITIVES["capsule"].fault((0.03, 0.03, 0.02))
+    assert all(PRIMITIVES[name].fault(half) is None for name, half in HALF.items())
+
+
+@pytest.mark.parametrize("ends", [(0.03, 0.05), (0.05, 0.01), (0.03, 0.03)])
+def test_a_frustum_is_a_stack_of_discs_of_its_volume(ends):
+    low, high = ends
+    stack = frustum.discs((low, high, 0.04))
+    assert len(stack) == min(max(int(np.ceil(round(abs(high - low) / frustum.STEP, 9))), 1), frustum.MOST)
+    exact = np.pi * 0.08 * (low**2 + low * high + high**2) / 3
+    assert sum(np.pi * r**2 * 2 * half for _, r, half in stack) == pytest.approx(exact)
+    bottoms = [z - half for z, _, half in stack]
+    tops = [z + half for z, _, half in stack]
+    np.testing.assert_allclose([*bottoms, 0.04], [-0.04, *tops], atol=1e-12)
+
+
+def test_mass_properties_are_those_of_a_mesh_of_the_same_solids():
+    """Against trimesh, whose round solids have flat faces: within their lack of volume."""
+    turned = Compound((*MUG.pieces, Piece("box", (0.01, 0.02, 0.03), (-0.1, 0.02, 0.2), TILTED)), 500.0, 0.5)
+    surfaces = [compounds.mesh(solid) for solid in solids(turned.pieces)]
+    whole = trimesh.util.concatenate(surfaces)
+    whole.density = 500.0
+    mass, centre, moments, rotation = inertial(turned)
+    assert mass == pytest.approx(whole.mass, rel=0.01)
+    np.testing.assert_allclose(centre, whole.center_mass, atol=5e-4)
+    np.testing.assert_allclose(rotation @ np.diag(moments) @ rotation.T, whole.moment_inertia, atol=0.01 * max(moments))
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_a_polyhedron_weighs_what_the_box_of_its_corners_weighs():
+    corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * HALF["box"]
+    polyhedron = Piece(CONVEX, (0.0,) * 3, (0.1, 0.0, 0.2), TILTED, tuple(map(tuple, corners.tolist())))
+    box = dataclasses.replace(polyhedron, shape="box", half_size=HALF["box"], vertices=())
+    given, wanted = (inertial(Compound((piece,), 500.0, 0.4)) for piece in (polyhedron, box))
+    for a, b in zip(given[:3], wanted[:3], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+    points, _ = even(3, HALF["box"], 2000)
+    np.testing.assert_array_equal(*(compounds.inside(piece, points + piece.position) for piece in (polyhedron, box)))
+
+
+def test_a_centred_compound_stays_as_it_is():
+    moved, centre = centred(MUG)
+    assert centre[2] == pytest.approx(0.05)
+    np.testing.assert_allclose(inertial(moved).centre, 0.0, atol=1e-7)
+    assert centred(moved)[0] is moved
+    np.testing.assert_allclose(inertial(moved).moments, inertial(MUG).moments, rtol=1e-5)
+
+
+def test_all_of_a_compound_is_in_the_hull_of_its_surface_points():
+    pieces = tuple(Piece(name, half, (0.05 * i, 0.02 * i, 0.0), TILTED) for i, (name, half) in enumerate(HALF.items()))
+    body = Compound((*pieces, Piece("frustum", (0.03, 0.05, 0.04), (0.0, 0.1, 0.0), TILTED)), 500.0, 0.5)
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    reach = (compounds.surface_points(body) @ directions.T).max(axis=0)
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-0.2, 0.3, (200_000, 3))
+    held = points[np.any([compounds.inside(solid, points) for solid in solids(body.pieces)], axis=0)]
+    assert len(held) > 1000
+    assert np.all((held @ directions.T).max(axis=0) <= reach)
+    assert np.all(np.abs(held).max(axis=0) <= compounds.half_extents(body))
+
+
+def test_parts_are_the_pieces_superquadrics():
+    body = Compound(
+        (
+            Piece("box", HALF["box"], (0.0, 0.0, 0.0), TILTED),
+            Piece("cylinder", HALF["cylinder"], (0.2, 0.0, 0.0)),
+            Piece("frustum", (0.02, 0.03, 0.05), (0.0, 0.2, 0.0)),
+        ),
+        500.0,
+        0.5,
+    )
+    box, cylinder, *stack = parts_of(body)
+    assert (box.exponents, cylinder.exponents) == ((0.2, 0.2), (0.2, 1.0))
+    np.testing.assert_array_equal(box.size, HALF["box"])
+    np.testing.assert_array_equal(box.rotation, body.pieces[0].rotation)
+    # What is left goes to the frustum.
+    assert len(stack) == PARTS - 2
+    np.testing.assert_allclose([part.position[2] for part in stack], [-0.025, 0.025])
+    assert volume_in_common(body) > 0.9
+    (smooth,) = parts_of(Compound((Piece("ellipsoid", HALF["ellipsoid"]),), 500.0, 0.5))
+    assert smooth.exponents == (1.0, 1.0)
+    assert volume_in_common(Compound((Piece("capsule", (0.02, 0.02, 0.06)),), 500.0, 0.5)) > 0.9
+
+
+def test_too_many_pieces_become_four_parts():
+    row = tuple(Piece("box", (0.01, 0.02, 0.03), (0.02 * i, 0.0, 0.0)) for i in range(6))
+    other = tuple(Piece("cylinder", (0.02, 0.02, 0.01), (0.3, 0.0, 0.02 * i)) for i in range(3))
+    body = Compound((*row, *other), 500.0, 0.5)
+    assert len(parts_of(body)) == PARTS
+    assert volume_in_common(body) > 0.9
+
+
+def test_a_mesh_of_convex_parts_is_taken_as_it_is(tmp_path):
+    boxes = [trimesh.creation.box((20, 30, 40)), trimesh.creation.box((10, 10, 90)).apply_translation((40, 0, 0))]
+    trimesh.util.concatenate(boxes).export(tmp_path / "two.obj")
+    pieces = convex_pieces(tmp_path / "two.obj", 0.001, "here")
+    assert [piece.shape for piece in pieces] == [CONVEX] * 2
+    volumes = sorted(float(compounds.hull(piece).volume) for piece in pieces)
+    np.testing.assert_allclose(volumes, [9e-6, 24e-6], rtol=1e-5)
+    assert volume_in_common(Compound(pieces, 500.0, 0.5)) > 0.9
+
+
+def test_a_hollow_mesh_is_cut_into_convex_pieces(tmp_path):
+    coacd = pytest.importorskip("coacd")
+    assert coacd is not None
+    trimesh.creation.annulus(0.03, 0.04, 0.05).export(tmp_path / "ring.stl")
+    pieces = convex_pieces(tmp_path / "ring.stl", 1.0, "here")
+    assert 2 <= len(pieces) <= 8
+    exact = np.pi * 0.05 * (0.04**2 - 0.03**2)
+    assert exact < sum(float(compounds.hull(piece).volume) for piece in pieces) < 2.0 * exact
+
+
+def test_what_no_mesh_is_is_one_line(tmp_path, monkeypatch):
+    import sys
+
+    (tmp_path / "text.obj").write_text("no mesh")
+    trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], [(0, 1, 2), (1, 3, 2)]).export(tmp_path / "flat.stl")
+    trimesh.creation.annulus(0.03, 0.04, 0.05).export(tmp_path / "ring.stl")
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    for name, reason in (
+        ("none.obj", "cannot be read"),
+        ("text.obj", "no triangles"),
+        ("flat.stl", "coacd|flat|convex"),
+        ("ring.stl", r"install CoACD with: pip install 'mechsearch-jax\[objects\]'"),
+    ):
+        with pytest.raises(InputError, match=reason) as error:
+            convex_pieces(tmp_path / name, 1.0, "scene.json: objects[0].mesh")
+        assert str(error.value).startswith("scene.json: objects[0].mesh: ")
+        assert "\n" not in str(error.value)
+
+
+def test_few_corners_are_left_of_many():
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=3).vertices)
+    few = thinned(ball)
+    assert len(few) <= compounds.MOST_VERTICES
+    assert trimesh.convex.convex_hull(few).volume > 0.8 * 4 / 3 * np.pi
+    np.testing.assert_array_equal(thinned(ball[:20]), ball[:20])
+
+
+def test_the_names_of_shapes_do_not_meet():
+    assert not {COMPOUND, CONVEX, frustum.NAME} & set(PRIMITIVES)
