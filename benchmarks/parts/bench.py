@@ -26,7 +26,7 @@ from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.pushing.pushes import PushesConfig, draw_push, push_tables
-from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+from mechsearch_jax.envs.scenes.generator import ScenarioGenerator, draws_from
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -239,7 +239,8 @@ def _states(
 ) -> tuple[Problem, list[tuple[Array, Belief, Observation]], dict[str, int]]:
     """The problem, key, belief and observation at the start of generated scenes, and the sizes."""
     around = {"shelf": workcell.shelf, "camera": workcell.camera, "gripper": workcell.gripper}
-    generator = ScenarioGenerator(workcell.target, **around, sizes=sizes)
+    draw = draws_from(sizes or ObjectSizes())
+    generator = ScenarioGenerator(workcell.target, **around, draw=draw)
     problem = planner.build_problem(target=generator.target, **around, config=config.problem)
     states = []
     for seed in range(scenes):

@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mechsearch_jax.envs.camera.compound_rays import cast_solids, solid_normals
 from mechsearch_jax.envs.world.model import shelf_corners
-from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
+from mechsearch_jax.shapes.compound import MOST_SOLIDS
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -106,6 +108,9 @@ def _cast_bodies(
     camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
 ) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
     """Depth along each ray and the slot of the first body that it hits; infinity and -1 where it hits none."""
+    if isinstance(world, CompoundWorld):
+        depth, solid = cast_solids(camera, world, directions)
+        return depth, (solid // MOST_SOLIDS).astype(jnp.int8)
 
     def nearer(i, best):
         depth, owner = best
@@ -146,14 +151,43 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     chosen = by_shape(world.kind[slot][..., None], lambda shape: shape.normal(local, half, jnp), jnp)
     chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
     body = rotate(rotation, chosen)
+    walls = _wall_normals(shelf, point)
+    return jnp.where((owner == SHELF)[:, None], walls, body).reshape(*flat, 3)
 
+
+def _wall_normals(shelf: Shelf, point: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Outward normals of the shelf at points on it."""
     x, y, z = (point[..., k] for k in range(3))
     gaps = jnp.stack(
         [jnp.abs(x - shelf.back), jnp.abs(y - shelf.right), jnp.abs(y - shelf.left), jnp.abs(z - shelf.board)], axis=-1
     )
     walls = jnp.array([(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)])
     wall = jnp.where(jnp.min(gaps, axis=-1) < 1e-4, jnp.argmin(gaps, axis=-1), 4)
-    return jnp.where((owner == SHELF)[:, None], walls[wall], body).reshape(*flat, 3)
+    return walls[wall]
+
+
+def _first_solids(camera: Camera, shelf: Shelf, world: CompoundWorld, directions: Array) -> tuple[Array, Array, Array]:
+    """Depth, owner and normal of what rays hit first, as `_first_bodies` of a world with compounds."""
+    depth, solid = cast_solids(camera, world, directions)
+    behind = cast_shelf(camera, shelf, directions)
+    owner = jnp.where(behind < depth, jnp.int8(SHELF), (solid // MOST_SOLIDS).astype(jnp.int8))
+    depth = jnp.minimum(depth, behind)
+    reached = directions * jnp.where(jnp.isfinite(depth), depth, 0.0)[..., None]
+    point = jnp.array([camera.position]) + reached.reshape(-1, 3)
+    body = solid_normals(world, point, solid.reshape(-1))
+    normals = jnp.where((owner == SHELF).reshape(-1, 1), _wall_normals(shelf, point), body)
+    return depth, owner, normals.reshape(directions.shape)
+
+
+def _first_bodies(camera: Camera, shelf: Shelf, world: World, directions: Array) -> tuple[Array, Array, Array]:
+    """Depth along each ray, what it hits first, as `Image.segmentation`, and the normal there."""
+    if isinstance(world, CompoundWorld):
+        return _first_solids(camera, shelf, world, directions)
+    depth, owner = _cast_bodies(camera, world, directions)
+    behind = cast_shelf(camera, shelf, directions)
+    owner = jnp.where(behind < depth, jnp.int8(SHELF), owner)
+    depth = jnp.minimum(depth, behind)
+    return depth, owner, _normals(camera, shelf, world, directions, depth, owner)
 
 
 @kept()
@@ -164,22 +198,28 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None, appearance
       camera: the camera.
       world: the bodies.
       shelf: the shelf; the default shelf if None.
-      appearance: of everything in the image; that of pictures, `PALETTE` in the light from `LIGHT`, if None.
+      appearance: of everything in the image; that of pictures, `PALETTE` or a compound's own colour in the light from
+        `LIGHT`, if None.
     """
     shelf = shelf or Shelf()
-    appearance = Appearance(PALETTE, np.array(LIGHT)) if appearance is None else appearance
+    appearance = _pictured(world) if appearance is None else appearance
     directions = rays(camera)
-    depth, owner = _cast_bodies(camera, world, directions)
-    behind = cast_shelf(camera, shelf, directions)
-    owner = jnp.where(behind < depth, jnp.int8(SHELF), owner)
-    depth = jnp.minimum(depth, behind)
-
+    depth, owner, normals = _first_bodies(camera, shelf, world, directions)
     light = _unit(appearance.light)
-    normals = _normals(camera, shelf, world, directions, depth, owner)
     shade = AMBIENT + (1.0 - AMBIENT) * jnp.maximum(sum(normals[..., k] * light[k] for k in range(3)), 0.0)
     colour = jnp.asarray(appearance.colours)[jnp.clip(owner, 0, SHELF)] * shade[..., None]
     colour = jnp.where((owner == BACKGROUND)[..., None], jnp.array([[BACKGROUND_COLOUR]]), colour)
     return Image(depth, owner, colour)
+
+
+def _pictured(world: World) -> Appearance:
+    """The appearance in pictures: compounds have their own colours, if they have any."""
+    colours: jax.Array | np.ndarray = PALETTE
+    if isinstance(world, CompoundWorld):
+        given = world.compounds.matter.colour
+        bodies = jnp.where(jnp.isnan(given), PALETTE[:BODIES], given)
+        colours = jnp.concatenate([bodies, PALETTE[BODIES:]])
+    return Appearance(colours, np.array(LIGHT))
 
 
 def _unit(vector: jax.Array | np.ndarray) -> jax.Array | np.ndarray:

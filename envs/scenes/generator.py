@@ -23,6 +23,7 @@ from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.shapes.compound import surface_points
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
@@ -31,6 +32,8 @@ from mechsearch_jax.workspace.target import Target
 
 # Shapes and half-extents of the paper's eleven objects; x and y of those that are not round may be swapped.
 CATALOGUE = ObjectSizes().catalogue
+# Draws an object, as it stands with its centre above the origin of a board at z 0.
+DrawBody = Callable[[np.random.Generator], Body]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +70,11 @@ class GeneratorConfig:
 
 def outline(body: Body) -> Float[np.ndarray, "corners 2"]:
     """A convex polygon that contains the body seen from above [m]."""
-    rim = shape_of(body.shape).rim(body.half_size)
-    corners = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-body.half_size[2], body.half_size[2])])
+    if body.compound is not None:
+        corners = surface_points(body.compound)
+    else:
+        rim = shape_of(body.shape).rim(body.half_size)
+        corners = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-body.half_size[2], body.half_size[2])])
     flat = (corners @ rotation_matrix(body.quaternion).T + np.array(body.position))[:, :2]
     return flat[ConvexHull(flat).vertices]
 
@@ -143,7 +149,7 @@ class ScenarioGenerator:
         config: GeneratorConfig | None = None,
         graspable: Callable[[Float[np.ndarray, " 3"]], bool] | None = None,
         gripper: Gripper | None = None,
-        sizes: ObjectSizes | None = None,
+        draw: DrawBody | None = None,
     ):
         """Args:
         target: the target to hide; the usual one by default.
@@ -152,7 +158,7 @@ class ScenarioGenerator:
         graspable: whether the target alone on the shelf is graspable at a pose (x, y [m], yaw [rad]); by default
           `graspable_alone`, or `graspable_at` if the target may stand anywhere.
         gripper: of the robot; the default gripper if None.
-        sizes: of the objects; the paper's if None.
+        draw: draws the objects; the paper's if None.
 
         Raises:
           InputError: objects would be dropped beside the board.
@@ -161,7 +167,7 @@ class ScenarioGenerator:
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
         self._camera = camera or Camera()
-        self._catalogue = (sizes or ObjectSizes()).catalogue
+        self._draw = draw or draws_from(ObjectSizes())
         for name, low, high in (("x", self._shelf.front, self._shelf.back), ("y", self._shelf.right, self._shelf.left)):
             spawn = getattr(self._shelf, f"spawn_{name}")
             if not (spawn[0] < high and spawn[1] > low):
@@ -193,7 +199,7 @@ class ScenarioGenerator:
         target = cell.target
         if shape is not None and shape != target.shape:
             target = target.resized(shape, Target.of(shape).half_size)
-        return cls(target, cell.shelf, cell.camera, gripper=cell.gripper, sizes=settings.objects)
+        return cls(target, cell.shelf, cell.camera, gripper=cell.gripper, draw=draws_from(settings.objects))
 
     def generate(self, seed: int, objects: int, name: str | None = None) -> Scenario:
         """A scenario whose bodies rest on the board, with a target that the detector does not see.
@@ -224,9 +230,9 @@ class ScenarioGenerator:
         dropped: list[Body] = []
         outlines: list[np.ndarray] = []
         for _ in range(objects):
-            shape, half = _draw_shape(rng, self._catalogue)
+            drawn = self._draw(rng)
             for _ in range(self.config.placements):
-                body = self._draw_body(rng, shape, half)
+                body = self._placed(rng, drawn)
                 polygon = outline(body)
                 clear = all(separation(polygon, other) > self.config.gap for other in outlines)
                 if clear and _on_board(polygon, self._shelf, self.config.gap):
@@ -240,11 +246,13 @@ class ScenarioGenerator:
         at_rest = outcome.settled and not outcome.fallen[:objects].any()
         return self._simulator.scenario(name) if at_rest else None
 
-    def _draw_body(self, rng: np.random.Generator, shape: str, half: tuple[float, float, float]) -> Body:
+    def _placed(self, rng: np.random.Generator, body: Body) -> Body:
+        """A body that stands on a board at z 0, above a random place, at a random yaw."""
         x, y = rng.uniform(*self._shelf.spawn_x), rng.uniform(*self._shelf.spawn_y)
         yaw = rng.uniform(-np.pi, np.pi)
-        height = self._shelf.board + half[2] + self.config.drop
-        return Body(shape, half, (x, y, height), (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)))  # pyright: ignore
+        height = self._shelf.board + body.position[2] + self.config.drop
+        turn = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+        return dataclasses.replace(body, position=(x, y, height), quaternion=turn)
 
     def _target_at(self, pose: np.ndarray) -> Body:
         x, y, yaw = (float(p) for p in pose)
@@ -286,8 +294,12 @@ class ScenarioGenerator:
         return bool(outcome.settled) and still and self.is_hidden(self._simulator.scenario(scene.name))
 
 
-def _draw_shape(rng: np.random.Generator, catalogue: Sequence[Any]) -> tuple[str, tuple[float, float, float]]:
-    """One of the objects of a catalogue and its half-extents."""
+def draws_from(sizes: ObjectSizes) -> DrawBody:
+    """A function that draws one of some boxes and cylinders."""
+    return functools.partial(_draw_shape, catalogue=sizes.catalogue)
+
+
+def _draw_shape(rng: np.random.Generator, catalogue: Sequence[Any]) -> Body:
     name, (x, y, z) = catalogue[int(rng.integers(len(catalogue)))]
     swapped = not shape_of(name).round and rng.random() < 0.5
-    return name, (y, x, z) if swapped else (x, y, z)
+    return Body(name, (y, x, z) if swapped else (x, y, z), (0.0, 0.0, z), (1.0, 0.0, 0.0, 0.0))

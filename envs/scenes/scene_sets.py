@@ -37,6 +37,7 @@ class Block:
       first_seed: of scene 0; the others follow.
       layout: "clutter" as `ScenarioGenerator` makes it, or "line" as `LineGenerator` does.
       shelf: one of `SHELVES`.
+      things: what objects are drawn from: "paper", its eleven boxes and cylinders, or "household".
     """
 
     name: str
@@ -46,6 +47,7 @@ class Block:
     first_seed: int
     layout: Literal["clutter", "line"] = "clutter"
     shelf: str = "usual"
+    things: Literal["paper", "household"] = "paper"
 
     def scene_name(self, index: int) -> str:
         """The name of a scene."""
@@ -72,10 +74,10 @@ class SceneSet(NamedTuple):
 
 
 def _blocks(
-    name: str, scenes: int, counts: Sequence[int], first_seed: int, target: str = "cylinder", shelf: str = "usual"
+    name: str, scenes: int, counts: Sequence[int], first_seed: int, target: str = "cylinder", **more: Any
 ) -> tuple[Block, ...]:
     """One block for each number of objects, all from the same seeds: the generator mixes that number into the seed."""
-    return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed, shelf=shelf) for count in counts)
+    return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed, **more) for count in counts)
 
 
 # By name; those of benchmarks/parts/views.
@@ -107,6 +109,10 @@ _EXPERIMENTS = (
             ("narrow", "a narrower shelf", 150_000),
             ("wide", "a wider, deeper shelf", 160_000),
         )
+    ),
+    SceneSet("household", "household things", _blocks("household", 200, (4, 8), 170_000, things="household")),
+    SceneSet(
+        "household-box", "household things", _blocks("household-box", 50, (4, 8), 180_000, "box", things="household")
     ),
 )
 
@@ -153,10 +159,11 @@ def find_scene(name: str) -> tuple[Block, int] | None:
 
 
 @functools.cache
-def _generate(layout: str, target: str, shelf: str) -> Callable[[int, int, str], Scenario]:
+def _generate(layout: str, target: str, shelf: str, things: str) -> Callable[[int, int, str], Scenario]:
     """A function that generates a scene from its seed, its number of objects and its name."""
     # Imported here because it takes long, and nothing is generated if all files exist.
     from mechsearch_jax.envs.scenes.generator import GeneratorConfig, ScenarioGenerator
+    from mechsearch_jax.envs.scenes.household import draw_body
     from mechsearch_jax.envs.scenes.three_objects import LineGenerator
     from mechsearch_jax.workspace.detector import FOUND_PIXELS
     from mechsearch_jax.workspace.target import Target
@@ -164,7 +171,8 @@ def _generate(layout: str, target: str, shelf: str) -> Callable[[int, int, str],
     config = GeneratorConfig(visible=FOUND_PIXELS, anywhere=True)
     match layout:
         case "clutter":
-            return ScenarioGenerator(Target.of(target), SHELVES[shelf], config=config).generate
+            draw = draw_body if things == "household" else None
+            return ScenarioGenerator(Target.of(target), SHELVES[shelf], config=config, draw=draw).generate
         case "line":
             line = LineGenerator(checks=config)
             return lambda seed, objects, name: line.generate(seed, name)
@@ -183,7 +191,7 @@ def make_scene(block: Block, index: int) -> Scenario:
     """
     if not 0 <= index < block.scenes:
         raise InputError(f"{block.name}: there is no scene {index}; there are {block.scenes}, counted from 0")
-    generate = _generate(block.layout, block.target, block.shelf)
+    generate = _generate(block.layout, block.target, block.shelf, block.things)
     return generate(block.first_seed + index, block.objects, block.scene_name(index))
 
 

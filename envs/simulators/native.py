@@ -22,7 +22,7 @@ from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, check_acti
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
-from mechsearch_jax.envs.world.world import BODIES, World
+from mechsearch_jax.envs.world.world import BODIES, World, alike
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, motions
@@ -155,7 +155,7 @@ class NativeSimulator:
         )
 
     def _gather(self) -> World:
-        worlds = [jax.device_get(world.world) for world in self._worlds]
+        worlds = alike([jax.device_get(world.world) for world in self._worlds])
         world: World = jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *worlds)
         self.world = world
         return world

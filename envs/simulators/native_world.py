@@ -148,13 +148,21 @@ class NativeWorld:
           cell: with the factors on sliding frictions and masses, the physics, and where the robot stands.
         """
         self._bodies = bodies
-        self._model = models.with_bodies(self._blank, bodies, mass=cell.mass * cell.body_mass)
+        self._model = models.with_bodies(self._model_for(bodies), bodies, mass=cell.mass * cell.body_mass)
         self._model.geom_friction[:, 0] *= cell.friction
-        self._model.geom_friction[models.body_geometries(self._blank), 0] *= cell.body_friction[:, None]
+        slots = models.geometry_slots(self._model)
+        self._model.geom_friction[slots >= 0, 0] *= cell.body_friction[slots[slots >= 0]]
         models.move_robot(self._model, cell.T_world_base)
         PHYSICS[cell.physics](self._model)
         self._data = models.initial_state(self._model, bodies)
         self._go_home()
+
+    def _model_for(self, bodies: list[Body | None]) -> mujoco.MjModel:
+        """The model with the geometry of the compounds among the bodies, in 6 ms; the blank one without compounds."""
+        compounds = models.compounds_in(bodies)
+        if not compounds:
+            return self._blank
+        return models.compile_model(self.shelf, self.camera, self._blank.opt.timestep, compounds)
 
     def drive(self, controls: Float[np.ndarray, "steps 9"], at_once: bool = False) -> Float[np.ndarray, "steps 9"]:
         """Step with one row of controls per step from where everything is, and let the bodies come to rest.

@@ -12,7 +12,8 @@ millimetre. Sizes, masses and inertias are set per world, on a copy of the compi
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree
 
@@ -21,10 +22,20 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.envs.world.body_model import (
+    EMPTY_INERTIA,
+    EMPTY_MASS,
+    TINY,
+    add_bodies,
+    element,
+    geometry_name,
+    parking_place,
+    text,
+)
 from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
-from mechsearch_jax.shapes import Shape, by_shape, in_order, shape_of
+from mechsearch_jax.shapes import by_shape, in_order, shape_of
+from mechsearch_jax.shapes.compound import Compound, inertial
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf
@@ -43,11 +54,6 @@ FINGER_TRAVEL = 0.04
 # Geometries are smaller than the bodies by MARGIN, and contacts act at that distance from them: resting bodies touch at
 # their true surfaces, yet collision detection always sees them a little apart.
 MARGIN = 5e-4
-# Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; otherwise negligible.
-BODY_DAMPING = 2e-3
-TINY = 1e-3
-# Mass of an empty slot [kg], and its moments of inertia [kg m2].
-EMPTY_MASS, EMPTY_INERTIA = 1e-3, 1e-6
 OBJECT_BIT, ROBOT_BIT = 1, 2
 
 # Mass [kg], centre of mass [m], and inertia about it (xx, yy, zz, xy, xz, yz) [kg m2] of links 1 to 7: C. Gaz et al.,
@@ -66,17 +72,9 @@ HAND_INERTIA = (0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0)
 FINGER_INERTIA = (0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0.0, 0.0, 0.0))
 
 
-def _text(*numbers: float | np.floating) -> str:
-    return " ".join(f"{float(n):.9g}" for n in numbers)
-
-
-def _element(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
-    return ElementTree.SubElement(parent, tag, {k.rstrip("_"): v for k, v in attributes.items()})
-
-
 def _inertial(body: ElementTree.Element, inertia: tuple) -> None:
     mass, centre, full = inertia
-    _element(body, "inertial", mass=_text(mass), pos=_text(*centre), fullinertia=_text(*full))
+    element(body, "inertial", mass=text(mass), pos=text(*centre), fullinertia=text(*full))
 
 
 def _solids(body: ElementTree.Element, solids: Sequence[Primitive]) -> None:
@@ -84,39 +82,39 @@ def _solids(body: ElementTree.Element, solids: Sequence[Primitive]) -> None:
         turn = Rotation.from_matrix(solid.T_frame_primitive[:3, :3]).as_quat(scalar_first=True)
         # A capsule is drawn in by its radius alone; a box on every side.
         drawn_in = (MARGIN, MARGIN, MARGIN) if solid.kind == "box" else (MARGIN, 0.0)
-        _element(
+        element(
             body,
             "geom",
             class_="robot",
             type=solid.kind,
-            size=_text(*np.subtract(solid.size, drawn_in)),
-            pos=_text(*solid.T_frame_primitive[:3, 3]),
-            quat=_text(*turn),
+            size=text(*np.subtract(solid.size, drawn_in)),
+            pos=text(*solid.T_frame_primitive[:3, 3]),
+            quat=text(*turn),
         )
 
 
 def _add_defaults(root: ElementTree.Element) -> None:
-    default = _element(root, "default")
-    _element(default, "geom", condim="4", margin=_text(MARGIN))
-    robot = _element(default, "default", class_="robot")
+    default = element(root, "default")
+    element(default, "geom", condim="4", margin=text(MARGIN))
+    robot = element(default, "default", class_="robot")
     # The robot's contact parameters take priority, stiffer than the default: in a soft grip objects creep and turn.
-    _element(
+    element(
         robot,
         "geom",
         contype=str(ROBOT_BIT),
         conaffinity=str(OBJECT_BIT),
         priority="1",
-        friction=_text(FINGER_FRICTION, FINGER_TORSION, 0.0),
+        friction=text(FINGER_FRICTION, FINGER_TORSION, 0.0),
         solref="0.01 1",
         group="3",
     )
-    objects = _element(default, "default", class_="object")
-    _element(objects, "geom", contype=str(OBJECT_BIT), conaffinity=str(OBJECT_BIT), size=_text(*[TINY] * 3), group="0")
+    objects = element(default, "default", class_="object")
+    element(objects, "geom", contype=str(OBJECT_BIT), conaffinity=str(OBJECT_BIT), size=text(*[TINY] * 3), group="0")
     # The friction of a contact is the larger of the two, here that of the body on the plane.
-    planes = _element(default, "default", class_="plane")
-    _element(planes, "geom", type="plane", contype="0", conaffinity=str(OBJECT_BIT), friction="0 0 0", group="4")
-    boards = _element(default, "default", class_="board")
-    _element(boards, "geom", type="box", contype="0", conaffinity=str(ROBOT_BIT), group="1", rgba="0.8 0.75 0.65 1")
+    planes = element(default, "default", class_="plane")
+    element(planes, "geom", type="plane", contype="0", conaffinity=str(OBJECT_BIT), friction="0 0 0", group="4")
+    boards = element(default, "default", class_="board")
+    element(boards, "geom", type="box", contype="0", conaffinity=str(ROBOT_BIT), group="1", rgba="0.8 0.75 0.65 1")
 
 
 def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
@@ -128,102 +126,82 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
     ):
         position = [0.0, 0.0, 0.0]
         position[axis] = value - MARGIN * sum(normal)
-        _element(
+        element(
             world,
             "geom",
             class_="plane",
             name=f"{name}_plane",
-            pos=_text(*position),
-            zaxis=_text(*normal),
+            pos=text(*position),
+            zaxis=text(*normal),
             size="1 1 1",
         )
     for name, (low, high) in shelf_boxes(shelf).items():
         centre, half = (high + low) / 2, (high - low) / 2
         # Carried objects may be above the upper board in front of the shelf, which therefore is a box, not a plane.
         meets = {"conaffinity": str(ROBOT_BIT | OBJECT_BIT)} if name == "ceiling" else {}
-        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half), **meets)
+        element(world, "geom", class_="board", name=f"{name}_box", pos=text(*centre), size=text(*half), **meets)
 
 
 def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
     parent = world
     quarter = {0: (1.0, 0.0, 0.0, 0.0), 1: (0.5**0.5, 0.5**0.5, 0.0, 0.0), -1: (0.5**0.5, -(0.5**0.5), 0.0, 0.0)}
-    actuator = _element(root, "actuator")
+    actuator = element(root, "actuator")
     for i, (a, turns, d) in enumerate(JOINTS):
         position = (a, -turns * d, 0.0) if turns else (a, 0.0, d)
-        parent = _element(
-            parent, "body", name=f"link{i + 1}", pos=_text(*position), quat=_text(*quarter[turns]), gravcomp="1"
+        parent = element(
+            parent, "body", name=f"link{i + 1}", pos=text(*position), quat=text(*quarter[turns]), gravcomp="1"
         )
         _inertial(parent, LINK_INERTIAS[i])
-        _element(
+        element(
             parent,
             "joint",
             name=f"joint{i + 1}",
             axis="0 0 1",
-            range=_text(JOINT_LOWER[i], JOINT_UPPER[i]),
-            damping=_text(ARM_DAMPING),
+            range=text(JOINT_LOWER[i], JOINT_UPPER[i]),
+            damping=text(ARM_DAMPING),
             armature="0.1",
         )
         _solids(parent, LINKS[i])
-        _element(
+        element(
             actuator,
             "position",
             name=f"joint{i + 1}",
             joint=f"joint{i + 1}",
-            kp=_text(ARM_STIFFNESS[i]),
-            kv=_text(ARM_VELOCITY_GAIN[i]),
-            forcerange=_text(-ARM_FORCE[i], ARM_FORCE[i]),
+            kp=text(ARM_STIFFNESS[i]),
+            kv=text(ARM_VELOCITY_GAIN[i]),
+            forcerange=text(-ARM_FORCE[i], ARM_FORCE[i]),
         )
     turned = (np.cos(HAND_ANGLE / 2), 0.0, 0.0, np.sin(HAND_ANGLE / 2))
-    hand = _element(parent, "body", name="hand", pos=_text(0.0, 0.0, FLANGE), quat=_text(*turned), gravcomp="1")
+    hand = element(parent, "body", name="hand", pos=text(0.0, 0.0, FLANGE), quat=text(*turned), gravcomp="1")
     _inertial(hand, HAND_INERTIA)
     _solids(hand, HAND)
-    _element(hand, "site", name="gripper", pos=_text(0.0, 0.0, FINGER_TIPS), group="5")
+    element(hand, "site", name="gripper", pos=text(0.0, 0.0, FINGER_TIPS), group="5")
     for name, quaternion in (("left", (1.0, 0.0, 0.0, 0.0)), ("right", (0.0, 0.0, 0.0, 1.0))):
-        finger = _element(
-            hand, "body", name=f"{name}_finger", pos=_text(0.0, 0.0, FINGER_BASE), quat=_text(*quaternion), gravcomp="1"
+        finger = element(
+            hand, "body", name=f"{name}_finger", pos=text(0.0, 0.0, FINGER_BASE), quat=text(*quaternion), gravcomp="1"
         )
         _inertial(finger, FINGER_INERTIA)
-        _element(
+        element(
             finger,
             "joint",
             name=f"{name}_finger",
             type="slide",
             axis="0 1 0",
-            range=_text(0.0, FINGER_TRAVEL),
+            range=text(0.0, FINGER_TRAVEL),
             armature="0.1",
         )
         _solids(finger, FINGER)
-        _element(
+        element(
             actuator,
             "position",
             name=f"{name}_finger",
             joint=f"{name}_finger",
-            kp=_text(FINGER_STIFFNESS),
-            kv=_text(FINGER_VELOCITY_GAIN),
-            forcerange=_text(-FINGER_FORCE, FINGER_FORCE),
+            kp=text(FINGER_STIFFNESS),
+            kv=text(FINGER_VELOCITY_GAIN),
+            forcerange=text(-FINGER_FORCE, FINGER_FORCE),
         )
-    equality = _element(root, "equality")
-    _element(equality, "joint", joint1="right_finger", joint2="left_finger", polycoef="0 1 0 0 0")
-
-
-def _add_bodies(world: ElementTree.Element) -> None:
-    for i in range(BODIES):
-        body = _element(world, "body", name=f"body{i}", pos=_text(*parking_place(i)), gravcomp="1")
-        _element(body, "joint", name=f"body{i}", type="free", damping=_text(BODY_DAMPING))
-        _element(body, "inertial", mass=_text(EMPTY_MASS), pos="0 0 0", diaginertia=_text(*[EMPTY_INERTIA] * 3))
-        for shape in in_order():
-            name = geometry_name(shape, i)
-            _element(body, "geom", class_="object", name=name, type=shape.geometry, friction=_text(shape.friction))
-
-
-def geometry_name(shape: Shape, slot: int) -> str:
-    """The name of the geometry of a shape in a slot."""
-    return f"{shape.name}{slot}"
-
-
-def parking_place(slot: int) -> tuple[float, float, float]:
-    """The position of an unused slot: far in front of the shelf, on the free side of all its infinite planes [m]."""
-    return (-2.0, 0.02 * slot, 0.6)
+    equality = element(root, "equality")
+    element(equality, "joint", joint1="right_finger", joint2="left_finger", polycoef="0 1 0 0 0")
 
 
 def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
@@ -244,20 +222,28 @@ def shelf_boxes(shelf: Shelf) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return {name: (np.array(low), np.array(high)) for name, (low, high) in shelf_corners(shelf).items()}
 
 
-def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> str:
+def panda_shelf_mjcf(
+    shelf: Shelf,
+    camera: Camera,
+    timestep: float = 0.004,
+    compounds: Mapping[int, Compound] = MappingProxyType({}),
+    skin: float = MARGIN,
+) -> str:
     """The MJCF of the robot, the shelf, the camera, eight empty object slots and an empty slot for the target.
 
     Args:
       shelf: the shelf's dimensions.
       camera: the camera, for renderers; it must have square pixels and its principal point in the middle.
       timestep: of the simulation [s].
+      compounds: the compounds in slots, whose geometry is in the model; all other slots are empty.
+      skin: see `with_bodies`.
     """
     root = ElementTree.Element("mujoco", model="panda-shelf")
-    _element(root, "compiler", angle="radian", autolimits="true")
-    option = _element(
+    element(root, "compiler", angle="radian", autolimits="true")
+    option = element(
         root,
         "option",
-        timestep=_text(timestep),
+        timestep=text(timestep),
         integrator="implicitfast",
         cone="elliptic",
         impratio="10",
@@ -265,27 +251,33 @@ def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> s
         ls_iterations="50",
     )
     # Bounding volumes inside a body are not updated when its sizes are set per world.
-    _element(option, "flag", midphase="disable")
-    _element(_element(root, "visual"), "map", znear="0.01")
+    element(option, "flag", midphase="disable")
+    element(element(root, "visual"), "map", znear="0.01")
     _add_defaults(root)
-    world = _element(root, "worldbody")
-    _element(world, "light", pos="-0.5 0.1 2", dir="0.6 0 -1")
+    world = element(root, "worldbody")
+    element(world, "light", pos="-0.5 0.1 2", dir="0.6 0 -1")
     right, down, _ = np.array(camera.rotation).T
-    _element(
+    element(
         world,
         "camera",
         name="camera",
-        pos=_text(*camera.position),
-        xyaxes=_text(*right, *-down),
-        fovy=_text(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
+        pos=text(*camera.position),
+        xyaxes=text(*right, *-down),
+        fovy=text(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
     )
     _add_shelf(world, shelf)
     _add_robot(root, world)
-    _add_bodies(world)
+    add_bodies(root, world, compounds, skin)
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujoco.MjModel:
+def compile_model(
+    shelf: Shelf,
+    camera: Camera,
+    timestep: float = 0.004,
+    compounds: Mapping[int, Compound] = MappingProxyType({}),
+    skin: float = MARGIN,
+) -> mujoco.MjModel:
     """The compiled `panda_shelf_mjcf`.
 
     Stops MuJoCo in this process from writing MUJOCO_LOG.TXT into the working folder: outcomes report what goes wrong.
@@ -293,7 +285,7 @@ def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujo
     log = mujoco.MjLogConfig.get()
     log.logto_file = False
     mujoco.MjLogConfig.set(log)
-    return mujoco.MjModel.from_xml_string(panda_shelf_mjcf(shelf, camera, timestep))
+    return mujoco.MjModel.from_xml_string(panda_shelf_mjcf(shelf, camera, timestep, compounds, skin))
 
 
 def masses_and_inertias(
@@ -312,8 +304,16 @@ def masses_and_inertias(
     return library.asarray(mass), mass[..., None] * moments
 
 
+def compounds_in(bodies: Sequence[Body | None]) -> dict[int, Compound]:
+    """The compounds among the bodies in the slots, by slot."""
+    return {i: body.compound for i, body in enumerate(bodies) if body is not None and body.compound is not None}
+
+
 def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
-    """Mass [kg] and principal moments of inertia [kg m2] of a solid body, along its own axes."""
+    """Mass [kg] and principal moments of inertia [kg m2] of a solid body; of a plain one along its own axes."""
+    if body.compound is not None:
+        weight = inertial(body.compound)
+        return weight.mass, weight.moments
     mass, inertia = masses_and_inertias(np.array(shape_of(body.shape).code), np.array(body.half_size, float))
     return float(mass), inertia
 
@@ -327,7 +327,7 @@ def with_bodies(
     """A copy of the model whose slots have the shapes and masses of `bodies`; poses belong to the state.
 
     Args:
-      model: the compiled model.
+      model: the compiled model, with the geometry of compounds in their slots.
       bodies: one for each slot, the target last; None leaves a slot empty.
       skin: how much smaller the contact geometry is than the bodies [m]; 0 for pictures.
       mass: factor on the bodies' masses and inertias, or one for each.
@@ -339,6 +339,8 @@ def with_bodies(
         body_mass, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
         model.body_mass[index], model.body_inertia[index] = factors[i] * body_mass, factors[i] * inertia
         model.body_gravcomp[index] = 0.0 if body else 1.0
+        if body is not None and body.compound is not None:
+            continue
         for shape in in_order():
             used = body is not None and body.shape == shape.name
             half = np.array(body.half_size) - skin if body is not None and used else np.full(3, TINY)
@@ -350,9 +352,16 @@ def with_bodies(
     return model
 
 
-def body_geometries(model: mujoco.MjModel) -> Int[np.ndarray, "9 shapes"]:
-    """The numbers of the geometries in each body's slot, one for each shape."""
-    return np.array([[model.geom(geometry_name(shape, i)).id for shape in in_order()] for i in range(BODIES)])
+def body_geometries(model: mujoco.MjModel, slots: Iterable[int] = range(BODIES)) -> Int[np.ndarray, "n shapes"]:
+    """The numbers of the geometries in bodies' slots, one for each shape; there must be no compounds in them."""
+    return np.array([[model.geom(geometry_name(shape, i)).id for shape in in_order()] for i in slots])
+
+
+def geometry_slots(model: mujoco.MjModel) -> Int[np.ndarray, " geoms"]:
+    """The slot of the body that each geometry belongs to; -1 for those of robot and shelf."""
+    slot = np.full(model.nbody, -1)
+    slot[[model.body(f"body{i}").id for i in range(BODIES)]] = np.arange(BODIES)
+    return slot[model.geom_bodyid]
 
 
 def base_pose(

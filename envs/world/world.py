@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import flax.struct
 import jax
@@ -11,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from mechsearch_jax.envs.world.compounds import Compounds, body_of, compounds_of, with_polyhedra
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.shapes import Shape, in_order, shape_of
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
 
 TARGET = MAX_OBJECTS
@@ -45,6 +48,18 @@ class World(flax.struct.PyTreeNode):
     valid: jax.Array
 
 
+class CompoundWorld(World):
+    """A world of which some bodies are compounds; see `World`.
+
+    Kind and half size of a compound are those of the box about its centre of mass that contains it.
+
+    Attributes:
+      compounds: what the bodies are made of.
+    """
+
+    compounds: Compounds
+
+
 def slots(scenario: Scenario) -> list[Body | None]:
     """The scenario's bodies in the order of a `World`'s slots; None for an empty slot.
 
@@ -58,21 +73,51 @@ def slots(scenario: Scenario) -> list[Body | None]:
 
 
 def from_scenario(scenario: Scenario) -> World:
-    """The world of a scenario.
+    """The world of a scenario: a `CompoundWorld` if it has compounds.
 
     Raises:
-      InputError: there are more objects than slots.
+      InputError: there are more objects than slots, or a shape that cannot stand beside compounds.
     """
     empty = Body(in_order()[0].name, (1e-3, 1e-3, 1e-3), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     bodies = slots(scenario)
     filled = [body or empty for body in bodies]
-    return World(
-        kind=jax.device_put(np.array([shape_of(b.shape).code for b in filled], np.int32)),
+    world = World(
+        kind=jax.device_put(np.array([_outer_shape(b).code for b in filled], np.int32)),
         half_size=jax.device_put(np.array([b.half_size for b in filled], np.float32)),
         position=jax.device_put(np.array([b.position for b in filled], np.float32)),
         rotation=jax.device_put(np.stack([rotation_matrix(b.quaternion) for b in filled]).astype(np.float32)),
         valid=jax.device_put(np.array([b is not None for b in bodies])),
     )
+    if not any(body is not None and body.compound for body in bodies):
+        return world
+    return CompoundWorld(**_fields(world), compounds=compounds_of(bodies))
+
+
+def _outer_shape(body: Body) -> Shape:
+    return in_order()[0] if body.compound else shape_of(body.shape)
+
+
+def _fields(world: World) -> dict[str, Any]:
+    return {name: getattr(world, name) for name in World.__dataclass_fields__}
+
+
+def alike(worlds: Sequence[World]) -> list[World]:
+    """The worlds with the same leaves, so that they can be stacked: all of compounds if one is.
+
+    Args:
+      worlds: fields without further leading axes.
+
+    Raises:
+      InputError: a body has a shape that cannot stand beside compounds.
+    """
+    if not any(isinstance(world, CompoundWorld) for world in worlds):
+        return list(worlds)
+    compounds = [
+        world.compounds if isinstance(world, CompoundWorld) else compounds_of(bodies_of(world)) for world in worlds
+    ]
+    if any(each.solids.faces.shape[-2] for each in compounds):
+        compounds = [with_polyhedra(each) for each in compounds]
+    return [CompoundWorld(**_fields(world), compounds=each) for world, each in zip(worlds, compounds, strict=True)]
 
 
 def bodies_of(world: World) -> list[Body | None]:
@@ -83,16 +128,19 @@ def bodies_of(world: World) -> list[Body | None]:
     """
     host = jax.device_get(world)
     quaternions = Rotation.from_matrix(np.where(host.valid[:, None, None], host.rotation, np.eye(3))).as_quat()
-    return [
-        Body(
+    quaternions = quaternions[:, [3, 0, 1, 2]]
+    made = host.compounds if isinstance(host, CompoundWorld) else None
+
+    def body(i: int) -> Body:
+        if made is not None and made.compound[i]:
+            return body_of(made, i, (host.position[i].tolist(), quaternions[i].tolist()))
+        return Body(
             in_order()[host.kind[i]].name,
             *(tuple(float(v) for v in values) for values in (host.half_size[i], host.position[i])),  # pyright: ignore
-            tuple(float(v) for v in quaternions[i, [3, 0, 1, 2]]),  # pyright: ignore
+            tuple(float(v) for v in quaternions[i]),  # pyright: ignore
         )
-        if host.valid[i]
-        else None
-        for i in range(BODIES)
-    ]
+
+    return [body(i) if host.valid[i] else None for i in range(BODIES)]
 
 
 def superquadrics(world: World) -> Superquadrics:

@@ -144,7 +144,7 @@ def inside(piece: Piece, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "
     local = (points - np.array(piece.position)) @ piece.rotation
     if piece.shape == CONVEX:
         rows = faces(piece)
-        return (local @ rows[:, :3].T <= rows[:, 3]).all(axis=1)
+        return np.all(local @ rows[:, :3].T <= rows[:, 3], axis=1)
     return PRIMITIVES[piece.shape].inside(local, np.array(piece.half_size), np)
 
 

@@ -1,0 +1,119 @@
+"""Rays that meet the solids of compounds, in closed form."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from mechsearch_jax.envs.world.compounds import Solids
+from mechsearch_jax.envs.world.world import BODIES, CompoundWorld
+from mechsearch_jax.geometry.transforms import matmul, rotate
+from mechsearch_jax.shapes import PRIMITIVES
+from mechsearch_jax.shapes.compound import CONVEX_CODE, MOST_SOLIDS
+from mechsearch_jax.workspace.camera import Camera
+
+# Index of what is no solid.
+NONE = -1
+
+
+def placed(world: CompoundWorld) -> Solids:
+    """The solids of all bodies in one row each, in the world: leading axis 144; body `i // 16` owns solid i."""
+    solids = world.compounds.solids
+    rotation = matmul(world.rotation[:, None], solids.rotation)
+    position = rotate(world.rotation[:, None], solids.position) + world.position[:, None]
+    valid = solids.valid & world.valid[:, None]
+    moved = solids.replace(rotation=rotation, position=position, valid=valid)
+    return jax.tree.map(lambda leaf: leaf.reshape(BODIES * MOST_SOLIDS, *leaf.shape[2:]), moved)
+
+
+def cast_solids(
+    camera: Camera, world: CompoundWorld, directions: Float[Array, "*pixels 3"]
+) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
+    """Depth along each ray [m] and the index of the first solid that it hits; infinity and `NONE` where it hits none.
+
+    Args:
+      camera: where the rays start.
+      world: the bodies.
+      directions: of unit depth, as `pixel_rays` returns them.
+    """
+    solids = placed(world)
+    miss = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
+
+    def nearer(i, best):
+        depth, owner = best
+        candidate = jax.lax.cond(solids.valid[i], lambda i: _cast(camera, solids, i, directions), lambda _: miss, i)
+        return jnp.minimum(depth, candidate), jnp.where(candidate < depth, i.astype(jnp.int16), owner)
+
+    nothing = jnp.full(directions.shape[:-1], NONE, jnp.int16)
+    return jax.lax.fori_loop(0, len(solids.valid), nearer, (miss, nothing))
+
+
+def _cast(camera: Camera, solids: Solids, i: Array, directions: Array) -> Array:
+    """Depth of a single solid along rays."""
+    rotation = solids.rotation[i]
+    start = jnp.array(camera.position) - solids.position[i]
+    origin = [jnp.dot(rotation[:, k], start, precision="highest") for k in range(3)]
+    x, y, z = (directions[..., k] for k in range(3))
+    direction = [rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z for k in range(3)]
+    cuts = [partial(primitive.cut, origin, direction, solids.half_size[i], jnp) for primitive in PRIMITIVES.values()]
+    if solids.faces.shape[-2]:
+        cuts.append(partial(cut_polyhedron, origin, direction, solids.faces[i]))
+    return jax.lax.switch(solids.kind[i], cuts)
+
+
+def cut_polyhedron(origin: list[Array], direction: list[Array], faces: Float[Array, "f 4"]) -> Float[Array, "*pixels"]:
+    """Where rays from outside enter a convex polyhedron; infinite for misses; see `shape.Shape.cut`."""
+
+    def clipped(f, span):
+        near, far = span
+        face = faces[f]
+        along = face[0] * direction[0] + face[1] * direction[1] + face[2] * direction[2]
+        height = face[3] - face[0] * origin[0] - face[1] * origin[1] - face[2] * origin[2]
+        safe = jnp.where(jnp.abs(along) < 1e-12, 1e-12, along)
+        where = height / safe
+        return (
+            jnp.where(safe < 0.0, jnp.maximum(near, where), near),
+            jnp.where(safe > 0.0, jnp.minimum(far, where), far),
+        )
+
+    everywhere = jnp.zeros_like(direction[0])
+    near, far = jax.lax.fori_loop(0, len(faces), clipped, (everywhere - jnp.inf, everywhere + jnp.inf))
+    return jnp.where((near <= far) & (near > 0.0), near, jnp.inf)
+
+
+def solid_normals(world: CompoundWorld, points: Float[Array, "n 3"], solid: Int[Array, " n"]) -> Float[Array, "n 3"]:
+    """Outward unit normals in the world at points on the surfaces of solids [m].
+
+    Args:
+      world: the bodies.
+      points: in the world.
+      solid: index of the solid of each, as of `cast_solids`; `NONE` gives any normal.
+    """
+    solids = placed(world)
+    row = jnp.maximum(solid, 0).astype(jnp.int32)
+    rotation, half = solids.rotation[row], solids.half_size[row]
+    local = rotate(jnp.swapaxes(rotation, -1, -2), points - solids.position[row])
+    kind = solids.kind[row][:, None]
+    chosen = jnp.zeros_like(local)
+    for primitive in PRIMITIVES.values():
+        chosen = jnp.where(kind == primitive.code, primitive.normal(local, half, jnp), chosen)
+    if solids.faces.shape[-2]:
+        chosen = jnp.where(kind == CONVEX_CODE, _nearest_face(solids, row, local), chosen)
+    chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
+    return rotate(rotation, chosen)
+
+
+def _nearest_face(solids: Solids, row: Array, local: Array) -> Array:
+    """The normal of the face of each point's polyhedron that it is farthest outside of; one face after the other."""
+
+    def farther(f, best):
+        height, normal = best
+        face = solids.faces[:, f][row]
+        above = jnp.sum(face[:, :3] * local, axis=-1) - face[:, 3]
+        return jnp.maximum(height, above), jnp.where((above > height)[:, None], face[:, :3], normal)
+
+    start = jnp.full(len(local), -jnp.inf, local.dtype), jnp.zeros_like(local)
+    return jax.lax.fori_loop(0, solids.faces.shape[-2], farther, start)[1]
