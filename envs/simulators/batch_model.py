@@ -79,6 +79,8 @@ def body_fields(
     half_size: Float[Array, "worlds 9 3"],
     valid: Bool[Array, "worlds 9"],
     cells: Cells,
+    weights: tuple[Float[Array, "worlds 9"], Float[Array, "worlds 9 3"]] | None = None,
+    shaped: range = range(BODIES),
 ) -> BodyFields:
     """The fields of a model whose slots hold the bodies of each world, float32; traceable.
 
@@ -86,9 +88,11 @@ def body_fields(
       blank: the compiled model with empty slots.
       kind, half_size, valid: of the bodies, as in a `World`.
       cells: of the worlds.
+      weights: masses [kg] and principal moments of inertia [kg m2]; those of the shapes if None.
+      shaped: the slots with a geometry of every shape.
     """
     worlds = len(kind)
-    mass, inertia = models.masses_and_inertias(kind, half_size, jnp)
+    mass, inertia = weights or models.masses_and_inertias(kind, half_size, jnp)
     mass = jnp.where(valid, mass, models.EMPTY_MASS)
     inertia = jnp.where(valid[..., None], inertia, models.EMPTY_INERTIA)
     mass, inertia = cells.mass * mass, cells.mass[..., None] * inertia
@@ -125,9 +129,9 @@ def body_fields(
     put("dof_invweight0", dof, jnp.repeat(inverse, 3, axis=-1).reshape(worlds, -1))
 
     for shape in in_order():
-        geom = np.array([blank.geom(models.geometry_name(shape, i)).id for i in range(BODIES)])
-        used = valid & (kind == shape.code)
-        half = jnp.where(used[..., None], half_size - models.MARGIN, models.TINY)
+        geom = np.array([blank.geom(models.geometry_name(shape, i)).id for i in shaped])
+        used = (valid & (kind == shape.code))[:, shaped.start :]
+        half = jnp.where(used[..., None], half_size[:, shaped.start :] - models.MARGIN, models.TINY)
         put("geom_size", geom, shape.geometry_size(half, jnp))
         put("geom_rbound", geom, shape.bounding_radius(half, jnp))
         put("geom_aabb", geom, jnp.concatenate([jnp.zeros_like(half), half], axis=-1))

@@ -20,11 +20,12 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool
 
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
+from mechsearch_jax.envs.simulators.compound_batch import ROOM, CompoundFields, compound_fields
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Overflow
-from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -86,17 +87,21 @@ class MjxModel:
     """The model that all worlds share, and functions of it.
 
     Attributes:
+      compounds: whether its slots have room for compounds.
       blank: the C MuJoCo model with empty slots.
       robot: the robot's configuration at home, shape (9,).
     """
 
-    def __init__(self, shelf: Shelf, camera: Camera, config: MjxConfig):
+    def __init__(self, shelf: Shelf, camera: Camera, config: MjxConfig, compounds: bool = False):
         """Raises:
         InputError: Warp cannot be imported.
         """
         self._mjx = import_mjx()
         self._config = config
-        blank = copy.copy(models.compile_model(shelf, camera, config.simulator.motion.timestep))
+        self.compounds = compounds
+        self._fields = CompoundFields if compounds else BodyFields
+        slots = ROOM if compounds else {}
+        blank = copy.copy(models.compile_model(shelf, camera, config.simulator.motion.timestep, slots))
         # Warp has no midphase that could be disabled.
         blank.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         # In Warp this flag selects C MuJoCo's box-box collision instead of the general convex one, which in float32
@@ -114,7 +119,7 @@ class MjxModel:
         option = option.replace(tolerance=jnp.maximum(option.tolerance, SOLVER_TOLERANCE))
         self._model = model.replace(opt=option)
         self._axes = jax.tree.map(lambda _: None, self._model).replace(
-            **dict.fromkeys(BodyFields.__dataclass_fields__, 0)
+            **dict.fromkeys(self._fields.__dataclass_fields__, 0)
         )
         parked = [np.array([*models.parking_place(i), 1.0, 0.0, 0.0, 0.0]) for i in range(BODIES)]
         self._parked = jnp.asarray(np.stack(parked), jnp.float32)
@@ -123,7 +128,10 @@ class MjxModel:
     def start(self, world: World, cells: Cells) -> tuple[BodyFields, Array, Array]:
         """The model's fields, configurations and commands of worlds at rest with the robot at home."""
         count = len(world.kind)
-        fields = body_fields(self.blank, world.kind, world.half_size, world.valid, cells)
+        if isinstance(world, CompoundWorld):
+            fields = compound_fields(self.blank, world, cells)
+        else:
+            fields = body_fields(self.blank, world.kind, world.half_size, world.valid, cells)
         upright = jnp.where(world.valid[..., None, None], world.rotation, jnp.eye(3)[None, None])
         quaternion = Rotation.from_matrix(upright.reshape(-1, 3, 3)).as_quat()[:, np.array([3, 0, 1, 2])]
         poses = jnp.concatenate([world.position, quaternion.reshape(count, BODIES, 4)], axis=-1)
@@ -148,12 +156,12 @@ class MjxModel:
     def kernels(self, worlds: int) -> Callable[[], None] | None:
         """Begin to compile Warp's kernels for `worlds` worlds in another process; see `compile_kernels`."""
         device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
-        batched = tuple(BodyFields.__dataclass_fields__)
+        batched = tuple(self._fields.__dataclass_fields__)
         return compile_kernels(self.blank, batched, worlds, self._config.contacts * worlds, self._config.rows, device)
 
     def step(self, fields: BodyFields, data: Any) -> Any:
         """The state of all worlds one time step later."""
-        model = self._model.replace(**{name: getattr(fields, name) for name in BodyFields.__dataclass_fields__})
+        model = self._model.replace(**{name: getattr(fields, name) for name in self._fields.__dataclass_fields__})
         return jax.vmap(self._mjx.step, in_axes=(self._axes, 0))(model, data)
 
     def holds_target(self, contacts: Any) -> Bool[Array, " worlds"]:

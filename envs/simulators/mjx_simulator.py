@@ -36,22 +36,25 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of
+from mechsearch_jax.envs.simulators.compound_batch import fitting, like_present
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.simulators.mjx_step import (
     Progress,
     Task,
     acting,
     advance,
+    at_rest,
     begin,
-    merged,
+    placed,
     taken_over,
+    tasks_merged,
     verdicts,
     waiting,
 )
 from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
-from mechsearch_jax.envs.world.world import World, from_scenario
+from mechsearch_jax.envs.world.world import CompoundWorld, World, alike, from_scenario
 from mechsearch_jax.runtime.compiled import Kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program
@@ -81,7 +84,6 @@ class MjxSimulator:
         self.camera = camera or Camera()
         self.config = config or MjxConfig()
         self.world: World | None = None
-        self._model = MjxModel(self.shelf, self.camera, self.config)
         self._fields: BodyFields | None = None
         # Of all worlds now, and of those that begin next.
         self._cells: list[ActualCell] = []
@@ -90,15 +92,7 @@ class MjxSimulator:
         # Task and progress of all worlds, and which outcomes were reported already; which worlds are moving.
         self._tasks: tuple[Task, Progress, Array] | None = None
         self._moving = np.zeros(0, bool)
-        # These depend on this simulator's model, so that no other process could use them.
-        self._start = Kept(self._model.start, on_disk=False)
-        self._place = Kept(_placed, on_disk=False, donate_argnums=(1,))
-        self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
-        self._go_on = Kept(self._gone_on, on_disk=False, donate_argnums=(1,))
-        self._prepared: frozenset[int] = frozenset()
-        self._merge = Kept(_merged, on_disk=False)
-        self._settle = jax.jit(self._simulate, donate_argnums=1)
-        self._rollout = jax.jit(self._follow, donate_argnums=1)
+        self._adopt(MjxModel(self.shelf, self.camera, self.config))
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
         """Start episodes, one world for each scenario; see `Simulator.reset`.
@@ -108,7 +102,7 @@ class MjxSimulator:
         """
         if not scenarios:
             raise InputError("MjxSimulator: no scenarios are given; reset it with one for each world")
-        worlds = [from_scenario(scenario) for scenario in scenarios]
+        worlds = alike([from_scenario(scenario) for scenario in scenarios])
         self._cells = [self._next_cells.pop(i, ASSUMED_CELL) for i in range(len(worlds))]
         return self.load(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
 
@@ -122,9 +116,29 @@ class MjxSimulator:
         new = jax.tree.map(np.array, self.world)
         for i, scenario in scenarios.items():
             self._cells[i] = self._next_cells.pop(i, ASSUMED_CELL)
-            for old, value in zip(jax.tree.leaves(new), jax.tree.leaves(from_scenario(scenario)), strict=True):
+            for old, value in zip(
+                jax.tree.leaves(new), jax.tree.leaves(like_present(self.world, scenario)), strict=True
+            ):
                 old[i] = value
         return self.load(new, np.isin(np.arange(count), list(scenarios)))
+
+    def _adopt(self, model: MjxModel) -> None:
+        """Take another model, with which everything is compiled anew."""
+        self._model, self._data = model, None
+        # These depend on this simulator's model, so that no other process could use them.
+        self._start = Kept(model.start, on_disk=False)
+        self._place = Kept(placed, on_disk=False, donate_argnums=(1,))
+        self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
+        self._go_on = Kept(self._gone_on, on_disk=False, donate_argnums=(1,))
+        self._prepared: frozenset[int] = frozenset()
+        self._merge = Kept(tasks_merged, on_disk=False)
+        self._settle = jax.jit(self._simulate, donate_argnums=1)
+        self._rollout = jax.jit(self._follow, donate_argnums=1)
+
+    def _use(self, world: World) -> None:
+        """Have the model that worlds need: that of compounds once there are any, and then for good."""
+        if isinstance(world, CompoundWorld) and not self._model.compounds:
+            self._adopt(MjxModel(self.shelf, self.camera, self.config, compounds=True))
 
     def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
         """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`.
@@ -149,6 +163,9 @@ class MjxSimulator:
             now = 0 if self.world is None else len(self.world.kind)
             raise InputError(f"MjxSimulator: {count} worlds cannot be set in part: there are {now} now")
         world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
+        if only is None:
+            self._use(world)
+        world = fitting(world, self._model.compounds)
         if len(self._cells) != count:
             self._cells = [ASSUMED_CELL] * count
         fields, qpos, ctrl = self._start(world, cells_of(self._model.blank, self._cells))
@@ -160,9 +177,9 @@ class MjxSimulator:
         changed = jax.device_put(np.ones(count, bool) if only is None else np.array(only))
         data, self._data = self._data, None
         old = new if only is None else (self._fields, self.world)
-        self._data, (self._fields, placed) = self._place(changed, data, qpos, ctrl, new, old)
-        self.world = placed
-        return placed
+        self._data, (self._fields, now) = self._place(changed, data, qpos, ctrl, new, old)
+        self.world = now
+        return now
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Execute an action in every world and let the bodies come to rest; see `Simulator.execute`.
@@ -226,6 +243,7 @@ class MjxSimulator:
 
     def programs(self, world: World) -> list[Program]:
         """All programs that reset, and act in, worlds of these shapes; see `Prepares`."""
+        self._use(world)
         count = len(world.kind)
         mask = jax.ShapeDtypeStruct((count,), bool)
         actions = jax.tree.map(lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), no_action())
@@ -316,7 +334,7 @@ class MjxSimulator:
         """`begin`, compiled, for worlds of which none is moving: the state, tasks, progress and reported worlds."""
         task, start = acting(data, actions, active, self._model.robot, self.config.simulator)
         data = data.replace(qpos=data.qpos.at[:, :ROBOT].set(where(task.moves, start, data.qpos[:, :ROBOT])))
-        data = _at_rest(data, task.moves)
+        data = at_rest(data, task.moves)
         return data, task, begin(task, data), ~active
 
     def _gone_on(self, fields: BodyFields, data: Any, world: World, tasks: tuple[Task, Progress, Array], least: Array):
@@ -335,7 +353,7 @@ class MjxSimulator:
         ended = progress.done & ~reported
         # Motion is stopped. A restored world gets back the commands of before the action.
         controls = where(progress.diverged, task.idle, task.controls[-1])
-        resting = _at_rest(data, ended & task.moves)
+        resting = at_rest(data, ended & task.moves)
         touch = self._model.step(fields, resting)
         in_hand = self._model.holds_target(touch._impl)
         data = touch.replace(
@@ -353,7 +371,7 @@ class MjxSimulator:
         """`execute` or `settle` as a whole: the state, the world and the outcome."""
         if actions is None:
             task = waiting(data, active)
-            data = _at_rest(data, task.moves)
+            data = at_rest(data, task.moves)
             tasks = task, begin(task, data), ~active
         else:
             data, task, progress, reported = self._begun(data, actions, active)
@@ -378,23 +396,3 @@ class MjxSimulator:
     def _time_step(self, fields: BodyFields, task: Task):
         step = functools.partial(self._model.step, fields)
         return functools.partial(advance, self.config.simulator, step, self._model.robot, task)
-
-
-def _placed(
-    changed: Bool[Array, " worlds"], data: Any, qpos: Array, ctrl: Array, new: tuple[Any, World], old: tuple[Any, World]
-) -> tuple[Any, tuple[Any, World]]:
-    """`load`, compiled: the state, and fields and worlds, with the changed worlds at rest."""
-    data = _at_rest(data, changed).replace(qpos=where(changed, qpos, data.qpos), ctrl=where(changed, ctrl, data.ctrl))
-    return data, jax.tree.map(functools.partial(where, changed), new, old)
-
-
-def _at_rest(data: Any, which: Bool[Array, " worlds"]) -> Any:
-    """The state with all motion stopped in the worlds `which`."""
-    still = jnp.zeros_like(data.qvel)
-    return data.replace(qvel=where(which, still, data.qvel), qacc_warmstart=where(which, still, data.qacc_warmstart))
-
-
-def _merged(keep: Bool[Array, " worlds"], old: tuple[Task, Progress, Array], new: tuple[Task, Progress, Array]):
-    """Tasks, progress and reported worlds: the old ones in the worlds `keep`, the new ones elsewhere."""
-    task, progress = merged(keep, old[:2], new[:2])
-    return task, progress, jnp.where(keep, old[2], new[2])

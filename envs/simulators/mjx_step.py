@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -316,3 +317,23 @@ def _slip(progress: Progress, body: Int[Array, " worlds"]) -> Float[Array, " wor
 def _finite(state: Array) -> Array:
     """In which worlds a state is finite: it has not diverged."""
     return jnp.all(jnp.abs(state) < LARGEST, axis=1)
+
+
+def placed(
+    changed: Bool[Array, " worlds"], data: Any, qpos: Array, ctrl: Array, new: tuple[Any, World], old: tuple[Any, World]
+) -> tuple[Any, tuple[Any, World]]:
+    """`load`, compiled: the state, and fields and worlds, with the changed worlds at rest."""
+    data = at_rest(data, changed).replace(qpos=where(changed, qpos, data.qpos), ctrl=where(changed, ctrl, data.ctrl))
+    return data, jax.tree.map(functools.partial(where, changed), new, old)
+
+
+def at_rest(data: Any, which: Bool[Array, " worlds"]) -> Any:
+    """The state with all motion stopped in the worlds `which`."""
+    still = jnp.zeros_like(data.qvel)
+    return data.replace(qvel=where(which, still, data.qvel), qacc_warmstart=where(which, still, data.qacc_warmstart))
+
+
+def tasks_merged(keep: Bool[Array, " worlds"], old: tuple[Task, Progress, Array], new: tuple[Task, Progress, Array]):
+    """Tasks, progress and reported worlds: the old ones in the worlds `keep`, the new ones elsewhere."""
+    task, progress = merged(keep, old[:2], new[:2])
+    return task, progress, jnp.where(keep, old[2], new[2])

@@ -112,12 +112,24 @@ def alike(worlds: Sequence[World]) -> list[World]:
     """
     if not any(isinstance(world, CompoundWorld) for world in worlds):
         return list(worlds)
-    compounds = [
-        world.compounds if isinstance(world, CompoundWorld) else compounds_of(bodies_of(world)) for world in worlds
-    ]
-    if any(each.solids.faces.shape[-2] for each in compounds):
-        compounds = [with_polyhedra(each) for each in compounds]
-    return [CompoundWorld(**_fields(world), compounds=each) for world, each in zip(worlds, compounds, strict=True)]
+    made = [as_compounds(world) for world in worlds]
+    if any(world.compounds.solids.faces.shape[-2] for world in made):
+        return [world.replace(compounds=with_polyhedra(world.compounds)) for world in made]
+    return [*made]
+
+
+def as_compounds(world: World) -> CompoundWorld:
+    """A world as one of compounds; a plain body is a single solid.
+
+    Args:
+      world: fields without further leading axes.
+
+    Raises:
+      InputError: a body has a shape that cannot stand beside compounds.
+    """
+    if isinstance(world, CompoundWorld):
+        return world
+    return CompoundWorld(**_fields(world), compounds=compounds_of(bodies_of(world)))
 
 
 def bodies_of(world: World) -> list[Body | None]:

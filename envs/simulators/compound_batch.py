@@ -1,0 +1,187 @@
+"""Compounds in the model of many worlds at once.
+
+Every slot of an object has room for the same number of solids of each kind, so that all scenes share one compiled
+program; rows without a solid shrink to a millimetre inside the first one. Convex polyhedra have no room: Warp keeps the
+vertices of meshes in the model, so that every new mesh would have to be compiled.
+"""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
+from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.compounds import Matter, Solids
+from mechsearch_jax.envs.world.world import TARGET, CompoundWorld, World, alike, as_compounds, from_scenario
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes import PRIMITIVES
+from mechsearch_jax.shapes.compound import CONVEX_CODE, Compound, Piece
+from mechsearch_jax.workspace.scenario import Scenario
+
+# Solids of each kind that an object may have.
+ROWS: Mapping[str, int] = MappingProxyType({"box": 4, "cylinder": 10, "ellipsoid": 2, "capsule": 4})
+_TINY = (2 * models.TINY, 2 * models.TINY, 2 * models.TINY)
+_EMPTY = Compound(tuple(Piece(name, _TINY) for name, count in ROWS.items() for _ in range(count)), 1.0, 1.0)
+# What the slots of all objects hold in the compiled model; the target's is as in the plain one.
+ROOM: Mapping[int, Compound] = MappingProxyType(dict.fromkeys(range(TARGET), _EMPTY))
+
+
+class CompoundFields(BodyFields):
+    """`BodyFields`, and those that differ between worlds of compounds alone."""
+
+    geom_pos: jax.Array
+    geom_quat: jax.Array
+    body_iquat: jax.Array
+
+
+def check_room(world: CompoundWorld) -> None:
+    """Check that the solids of objects fit into the model's rows.
+
+    Raises:
+      InputError: they do not, or there is a convex polyhedron.
+    """
+    solids = jax.device_get(world.compounds.solids)
+    kind, valid = (np.asarray(leaf)[..., :TARGET, :] for leaf in (solids.kind, solids.valid))
+    if (valid & (kind == CONVEX_CODE)).any():
+        raise InputError("MjxSimulator: meshes and convex polyhedra cannot be simulated here; use the NativeSimulator")
+    for name, most in ROWS.items():
+        count = int((valid & (kind == PRIMITIVES[name].code)).sum(axis=-1).max())
+        if count > most:
+            raise InputError(
+                f"MjxSimulator: an object has {count} solids of kind {name}, more than {most}; use the NativeSimulator"
+            )
+
+
+def fitting(world: World, room: bool) -> World:
+    """Worlds as a model takes them: plain ones as compounds of a single solid each, if it has room for compounds.
+
+    Args:
+      world: fields with a leading axis for the worlds.
+      room: whether the model has room for compounds.
+
+    Raises:
+      InputError: there are compounds and no room for them, or more solids of a kind than there is room for.
+    """
+    if not isinstance(world, CompoundWorld):
+        return _as_compounds(world) if room else world
+    if not room:
+        raise InputError("MjxSimulator: there are compounds among plain worlds; run them one set after the other")
+    check_room(world)
+    return world
+
+
+def _as_compounds(world: World) -> CompoundWorld:
+    rows = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], world) for i in range(len(world.kind))]
+    return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *(as_compounds(row) for row in rows))
+
+
+def like_present(present: World | None, scenario: Scenario) -> World:
+    """The world of a scenario, with the leaves of the present worlds.
+
+    Raises:
+      InputError: it has compounds, and the present worlds have none.
+    """
+    first: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], present)
+    world = alike([first, from_scenario(scenario)])[1]
+    if jax.tree.structure(world) != jax.tree.structure(first):
+        raise InputError(
+            f"MjxSimulator: {scenario.name} has compounds, the scenes before it have none; run them one set after the"
+            " other"
+        )
+    return world
+
+
+def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -> CompoundFields:
+    """The fields of a model whose slots hold the compounds of each world, float32; traceable.
+
+    Args:
+      blank: the compiled model with `ROOM`.
+      world: fields with a leading axis for the worlds.
+      cells: of the worlds.
+    """
+    plain = _plain_fields(blank, world, cells)
+    fields = {name: getattr(plain, name) for name in BodyFields.__dataclass_fields__}
+    worlds = len(world.kind)
+    for name in ("geom_pos", "geom_quat", "body_iquat"):
+        value = jnp.asarray(getattr(blank, name), jnp.float32)
+        fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
+
+    def put(name: str, where: np.ndarray, value: Array) -> None:
+        fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))
+
+    objects: tuple[Solids, Matter] = jax.tree.map(
+        lambda leaf: leaf[:, :TARGET], (world.compounds.solids, world.compounds.matter)
+    )
+    solids, matter = objects
+    there = world.valid[:, :TARGET]
+    friction = cells.friction[:, None] * matter.friction
+    geoms = _geoms(blank)
+    for name, rows in geoms.items():
+        half, position, rotation, used = _rows(solids, there, name)
+        primitive = PRIMITIVES[name]
+        flat = rows.reshape(-1)
+        put("geom_size", flat, primitive.geometry_size(half, jnp).reshape(worlds, -1, 3))
+        put("geom_rbound", flat, primitive.bounding_radius(half, jnp).reshape(worlds, -1))
+        box = jnp.stack([jnp.zeros_like(half), half], axis=-2)
+        put("geom_aabb", flat, box.reshape(worlds, -1, 2, 3))
+        put("geom_pos", flat, position.reshape(worlds, -1, 3))
+        put("geom_quat", flat, _quaternions(rotation).reshape(worlds, -1, 4))
+        sliding = jnp.broadcast_to(friction[..., None], used.shape).reshape(worlds, -1)
+        fields["geom_friction"] = fields["geom_friction"].at[:, flat, 0].set(sliding)
+    body = np.array([blank.body(f"body{i}").id for i in range(TARGET)])
+    identity = jnp.broadcast_to(jnp.eye(3), matter.axes.shape)
+    put("body_iquat", body, _quaternions(jnp.where(there[..., None, None], matter.axes, identity)))
+    return CompoundFields(**fields)
+
+
+def _plain_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -> BodyFields:
+    """`body_fields` with the masses of compounds, and the geometry of the target alone."""
+    matter = world.compounds.matter
+    weights = matter.mass, matter.moments
+    return body_fields(blank, world.kind, world.half_size, world.valid, cells, weights, range(TARGET, TARGET + 1))
+
+
+def _geoms(blank: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """The numbers of the geometries of each kind, shape (8, rows), in the order of `ROOM`."""
+    names = [piece.shape for piece in _EMPTY.pieces]
+    return {
+        kind: np.array(
+            [[blank.geom(f"solid{i}_{k}").id for k, name in enumerate(names) if name == kind] for i in range(TARGET)]
+        )
+        for kind in ROWS
+    }
+
+
+def _rows(
+    solids: Solids, there: Bool[Array, "w 8"], name: str
+) -> tuple[Float[Array, "w 8 n 3"], Float[Array, "w 8 n 3"], Float[Array, "w 8 n 3 3"], Bool[Array, "w 8 n"]]:
+    """Half-extents, position and rotation of the geometries of a kind, and which of them are used."""
+    mine = solids.valid & (solids.kind == PRIMITIVES[name].code) & there[..., None]
+    order = jnp.argsort(~mine, axis=-1, stable=True)[..., : ROWS[name]]
+
+    def taken(leaf: Array) -> Array:
+        index = order.reshape(*order.shape, *[1] * (leaf.ndim - order.ndim))
+        return jnp.take_along_axis(leaf, index, axis=2)
+
+    used = taken(mine)
+    half = jnp.where(used[..., None], taken(solids.half_size) - models.MARGIN, models.TINY)
+    # What is not used hides inside the first solid.
+    position = jnp.where(used[..., None], taken(solids.position), solids.position[:, :, :1])
+    return half, position, taken(solids.rotation), used
+
+
+def _quaternions(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 4"]:
+    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()[:, np.array([3, 0, 1, 2])]
+    return flat.reshape(*rotation.shape[:-2], 4)
