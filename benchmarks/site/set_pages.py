@@ -285,8 +285,8 @@ Which one?
 
 {CLUTTER}
 
-So are all sets but `d1` and `published`, whose pages say how they are. A page lists a set's seeds, and a digest of what
-its scenes hold.
+So are all sets but `d1`, `household*` and `published`, whose pages say how they are. A page lists a set's seeds, and a
+digest of what its scenes hold.
 
 ## How to read the rates
 

@@ -107,6 +107,22 @@ ABOUT: dict[str, About] = {
             ("wide", "a deeper and wider shelf"),
         )
     },
+    "household": About(
+        "household things",
+        "What the method does among mugs, bottles, bowls, books and fruit: 35 things, each of up to four boxes, "
+        "cylinders, ellipsoids, capsules and frustums. "
+        "![The catalogue: every thing as it stands, at its usual size](../household-things.png)",
+        "Objects are drawn evenly among the things, at a size drawn evenly from each thing's range, and dropped as "
+        "they stand; the rest is [as in most sets](index.md#how-they-are-made). The things are declared in "
+        "[household.toml](../../envs/scenes/household.toml).",
+        shown=((4, 0), (4, 1), (8, 0), (8, 1)),
+    ),
+    "household-box": About(
+        "household things, and a box as the target",
+        "As [`household`](household.md), with a target whose yaw matters.",
+        "As [`household`](household.md) is, from the seeds below.",
+        shown=((4, 0), (4, 1), (8, 0), (8, 1)),
+    ),
     "published": About(
         "of the method's authors",
         "The scenes that the method's authors published with their code: 200, of which 100 were used here, 25 each "

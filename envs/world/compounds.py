@@ -112,18 +112,17 @@ def pieces_of(body: Body) -> Compound:
     return Compound((Piece(shape.name, body.half_size),), shape.density, shape.friction)
 
 
-def compounds_of(bodies: Sequence[Body | None], polyhedra: bool = False) -> Compounds:
+def compounds_of(bodies: Sequence[Body | None]) -> Compounds:
     """What the bodies in a world's slots are made of, as NumPy arrays.
 
     Args:
       bodies: in their slots; None for an empty one.
-      polyhedra: whether to have room for convex polyhedra where there are none.
 
     Raises:
       InputError: a plain body is of a shape that is no primitive.
     """
     made = [None if body is None else pieces_of(body) for body in bodies]
-    wide = polyhedra or any(piece.shape == CONVEX for one in made if one for piece in one.pieces)
+    wide = any(piece.shape == CONVEX for one in made if one for piece in one.pieces)
     rows = [_body_solids(one, FACES if wide else 0) for one in made]
     return Compounds(
         compound=jax.device_put(np.array([body is not None and body.compound is not None for body in bodies])),

@@ -175,11 +175,6 @@ def inertial(compound: Compound) -> Inertial:
     return Inertial(compound.density * volume, np.asarray(centre), moments, axes)
 
 
-def volume(compound: Compound) -> float:
-    """The sum of the volumes of a compound's solids [m3]."""
-    return inertial(compound).mass / compound.density
-
-
 def centred(compound: Compound) -> tuple[Compound, Float[np.ndarray, " 3"]]:
     """The compound in a frame whose origin is the centre of mass, and where that is in the old frame [m].
 

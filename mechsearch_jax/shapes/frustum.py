@@ -15,11 +15,6 @@ NAME = "frustum"
 STEP, MOST = 2e-3, 6
 
 
-def fault(half_size: Sequence[float]) -> str | None:
-    """Why there is no frustum of radii at its lower and upper end and half a height; always None: any may differ."""
-    return None
-
-
 def discs(half_size: Sequence[float], count: int | None = None) -> list[tuple[float, float, float]]:
     """The stack: height of the centre, radius and half the height of each disc, from below [m].
 
