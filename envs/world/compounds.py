@@ -113,7 +113,7 @@ def pieces_of(body: Body) -> Compound:
 
 
 def compounds_of(bodies: Sequence[Body | None]) -> Compounds:
-    """What the bodies in a world's slots are made of, as NumPy arrays.
+    """What the bodies in a world's slots are made of.
 
     Args:
       bodies: in their slots; None for an empty one.
