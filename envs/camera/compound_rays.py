@@ -6,7 +6,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.world.compounds import Solids
 from mechsearch_jax.envs.world.world import BODIES, CompoundWorld
@@ -17,6 +17,8 @@ from mechsearch_jax.workspace.camera import Camera
 
 # Index of what is no solid.
 NONE = -1
+# By so much the cone of rays is taken to be wider, for rounding [rad].
+VIEW_MARGIN = 1e-3
 
 
 def placed(world: CompoundWorld) -> Solids:
@@ -40,6 +42,7 @@ def cast_solids(
       directions: of unit depth, as `pixel_rays` returns them.
     """
     solids = placed(world)
+    solids = solids.replace(valid=solids.valid & _in_view(camera, solids, directions))
     miss = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
 
     def nearer(i, best):
@@ -49,6 +52,19 @@ def cast_solids(
 
     nothing = jnp.full(directions.shape[:-1], NONE, jnp.int16)
     return jax.lax.fori_loop(0, len(solids.valid), nearer, (miss, nothing))
+
+
+def _in_view(camera: Camera, solids: Solids, directions: Float[Array, "*pixels 3"]) -> Bool[Array, " n"]:
+    """Which solids' bounding spheres reach into the cone around all rays; the others cannot be hit."""
+    units = (directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3)
+    axis = jnp.mean(units, axis=0)
+    axis = axis / jnp.linalg.norm(axis)
+    widest = jnp.arccos(jnp.clip(jnp.min(units @ axis), -1.0, 1.0))
+    away = solids.position - jnp.array([camera.position])
+    distance = jnp.linalg.norm(away, axis=-1)
+    radius = jnp.linalg.norm(solids.half_size, axis=-1)
+    around = jnp.arccos(jnp.clip(away @ axis / distance, -1.0, 1.0)) - jnp.arcsin(jnp.minimum(radius / distance, 1.0))
+    return (around <= widest + VIEW_MARGIN) | (distance <= radius)
 
 
 def _cast(camera: Camera, solids: Solids, i: Array, directions: Array) -> Array:

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     import trimesh
 
 CODE = 3
+# MuJoCo has no capsules without a length [m].
+SHORTEST = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Capsule:
 
     def geometry_size(self, half_size, library):
         radius, half = half_size[..., 0], half_size[..., 2] - half_size[..., 0]
-        return library.stack([radius, half, library.zeros_like(radius)], axis=-1)
+        return library.stack([radius, library.maximum(half, SHORTEST), library.zeros_like(radius)], axis=-1)
 
     def bounding_radius(self, half_size, library):
         return half_size[..., 2]

@@ -37,9 +37,10 @@ def _read(path: Path, changed: int, scale: float, where: str) -> tuple[Piece, ..
     loaded.apply_scale(scale)
     if not np.isfinite(loaded.vertices).all():
         raise InputError(f"{where}: {path} holds vertices that are not finite numbers; mend the mesh")
-    parts = loaded.split(only_watertight=False)
-    hulls = [part.vertices for part in parts if len(part.vertices) >= 4]
-    if not hulls or not all(_is_convex(part) for part in parts):
+    parts = loaded.split(only_watertight=False, repair=False)
+    if 0 < len(parts) <= MOST_SOLIDS and all(_is_convex(part) for part in parts):
+        hulls = [part.vertices for part in parts]
+    else:
         hulls = _decomposed(loaded, path, where)
     return tuple(_piece(np.asarray(vertices), path, where) for vertices in hulls)
 
@@ -92,8 +93,8 @@ def thinned(corners: Float[np.ndarray, "n 3"], most: int = MOST_VERTICES) -> Flo
 def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
     """The convex pieces of a mesh file, in the mesh's frame.
 
-    A mesh whose connected parts are convex is taken as it is. Any other is cut into at most `PIECES` pieces, always the
-    same; where that takes long, save the scenario: it then holds the pieces.
+    A mesh of at most 16 connected parts that are convex is taken as it is. Any other is cut into at most `PIECES`
+    pieces, always the same; where that takes long, save the scenario: it then holds the pieces.
 
     Args:
       path: of the file.
@@ -101,7 +102,7 @@ def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
       where: how messages begin.
 
     Raises:
-      InputError: it cannot be read, is no mesh, has flat parts or too many, or `coacd` is needed and not installed.
+      InputError: it cannot be read, is no mesh, has flat parts, or `coacd` is needed and not installed.
     """
     try:
         status = path.stat()
@@ -111,7 +112,4 @@ def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
         ) from None
     if status.st_size > LARGEST_FILE:
         raise InputError(f"{where}: {path} is larger than {LARGEST_FILE >> 20} MiB; simplify the mesh")
-    pieces = _read(path, status.st_mtime_ns, scale, where)
-    if len(pieces) > MOST_SOLIDS:
-        raise InputError(f"{where}: {path} has {len(pieces)} separate parts; at most {MOST_SOLIDS} can be simulated")
-    return pieces
+    return _read(path, status.st_mtime_ns, scale, where)
