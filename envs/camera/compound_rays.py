@@ -42,16 +42,19 @@ def cast_solids(
       directions: of unit depth, as `pixel_rays` returns them.
     """
     solids = placed(world)
-    solids = solids.replace(valid=solids.valid & _in_view(camera, solids, directions))
-    miss = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
+    seen = solids.valid & _in_view(camera, solids, directions)
+    # The number of turns is that of the solids in sight.
+    order = jnp.argsort(~seen, stable=True)
 
-    def nearer(i, best):
+    def nearer(turn, best):
         depth, owner = best
-        candidate = jax.lax.cond(solids.valid[i], lambda i: _cast(camera, solids, i, directions), lambda _: miss, i)
+        i = order[turn]
+        candidate = _cast(camera, solids, i, directions)
         return jnp.minimum(depth, candidate), jnp.where(candidate < depth, i.astype(jnp.int16), owner)
 
+    miss = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
     nothing = jnp.full(directions.shape[:-1], NONE, jnp.int16)
-    return jax.lax.fori_loop(0, len(solids.valid), nearer, (miss, nothing))
+    return jax.lax.fori_loop(0, jnp.sum(seen), nearer, (miss, nothing))
 
 
 def _in_view(camera: Camera, solids: Solids, directions: Float[Array, "*pixels 3"]) -> Bool[Array, " n"]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.compounds import Matter, Solids
-from mechsearch_jax.envs.world.world import TARGET, CompoundWorld, World, alike, as_compounds, from_scenario
+from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World, alike, as_compounds, from_scenario
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import CONVEX_CODE, Compound, Piece
@@ -140,9 +140,10 @@ def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -
         put("geom_quat", flat, _quaternions(rotation).reshape(worlds, -1, 4))
         sliding = jnp.broadcast_to(friction[..., None], used.shape).reshape(worlds, -1)
         fields["geom_friction"] = fields["geom_friction"].at[:, flat, 0].set(sliding)
-    body = np.array([blank.body(f"body{i}").id for i in range(TARGET)])
-    identity = jnp.broadcast_to(jnp.eye(3), matter.axes.shape)
-    put("body_iquat", body, _quaternions(jnp.where(there[..., None, None], matter.axes, identity)))
+    body = np.array([blank.body(f"body{i}").id for i in range(BODIES)])
+    axes = world.compounds.matter.axes
+    identity = jnp.broadcast_to(jnp.eye(3), axes.shape)
+    put("body_iquat", body, _quaternions(jnp.where(world.valid[..., None, None], axes, identity)))
     return CompoundFields(**fields)
 
 

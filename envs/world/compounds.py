@@ -6,6 +6,7 @@ A world without compounds stays a plain `World`, so that its programs stay what 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -136,8 +137,9 @@ def _stacked(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *trees)
 
 
+@functools.lru_cache(maxsize=1024)
 def _body_solids(compound: Compound | None, sides: int) -> Any:
-    """The rows of a body's solids, as a `Solids` of NumPy arrays."""
+    """The rows of a body's solids, as a `Solids` of NumPy arrays, which must not be changed."""
     rows = [] if compound is None else solids(compound.pieces)
     half = np.full((MOST_SOLIDS, 3), _NOTHING, np.float32)
     kind, position = np.zeros(MOST_SOLIDS, np.int32), np.zeros((MOST_SOLIDS, 3), np.float32)
@@ -154,6 +156,7 @@ def _body_solids(compound: Compound | None, sides: int) -> Any:
     return Solids(kind, half, position, rotation, planes, np.arange(MOST_SOLIDS) < len(rows))  # pyright: ignore
 
 
+@functools.lru_cache(maxsize=1024)
 def _matter(compound: Compound | None) -> Any:
     if compound is None:
         numbers = (_NOTHING, [_NOTHING] * 3, np.eye(3), 0.0, 1.0, [np.nan] * 3)
@@ -163,6 +166,7 @@ def _matter(compound: Compound | None) -> Any:
     return Matter(*(np.asarray(value, np.float32) for value in numbers))  # pyright: ignore[reportArgumentType]
 
 
+@functools.lru_cache(maxsize=1024)
 def _parts(compound: Compound | None) -> Any:
     parts = () if compound is None else parts_of(compound)
     size, exponents = np.full((PARTS, 3), _NOTHING, np.float32), np.ones((PARTS, 2), np.float32)
