@@ -87,6 +87,8 @@ DIGESTS = {
     "shelf-low": "f547905348d9",
     "shelf-narrow": "aaa051492858",
     "shelf-wide": "32c83e4f2af2",
+    "household": "1aed359436e1",
+    "household-box": "39016ed60239",
 }
 
 
