@@ -30,7 +30,7 @@ TARGET_BODY = Body("cylinder", (0.02, 0.02, 0.05), (0.7, 0.0, 0.4545), UPRIGHT)
 CORNERS = tuple(map(tuple, (np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * 0.03).tolist()))
 
 
-TYPES = {p.geometry: getattr(mujoco.mjtGeom, f"mjGEOM_{p.geometry.upper()}") for p in PRIMITIVES.values()}
+TYPES = {p.geometry: int(getattr(mujoco.mjtGeom, f"mjGEOM_{p.geometry.upper()}")) for p in PRIMITIVES.values()}
 
 
 def standing(*names, drop=0.0):
@@ -97,7 +97,7 @@ def _check_geometry(fields, w, slot, compiled):
     first = compiled.geom(f"solid{slot}_0")
     for g in np.flatnonzero(compiled.geom_bodyid == compiled.body(f"body{slot}").id):
         own = compiled.geom(g)
-        kind = next(n for n, p in PRIMITIVES.items() if TYPES[p.geometry] == own.type[0])
+        kind = next(n for n, p in PRIMITIVES.items() if TYPES[p.geometry] == int(own.type[0]))
         row = padded.geom(f"solid{slot}_{free[kind].pop(0)}").id
         for name in ("size", "rbound", "aabb", "pos", "friction"):
             mine = np.asarray(getattr(fields, f"geom_{name}")[w, row]).reshape(-1)
