@@ -101,7 +101,9 @@ def _check_geometry(fields, w, slot, compiled):
         row = padded.geom(f"solid{slot}_{free[kind].pop(0)}").id
         for name in ("size", "rbound", "aabb", "pos", "friction"):
             mine = np.asarray(getattr(fields, f"geom_{name}")[w, row]).reshape(-1)
-            np.testing.assert_allclose(mine, np.ravel(getattr(own, name)), 1e-5, 1e-6, f"{kind} {name}")
+            np.testing.assert_allclose(
+                mine, np.ravel(getattr(compiled, f"geom_{name}")[g]), 1e-5, 1e-6, f"{kind} {name}"
+            )
         turns = [
             Rotation.from_quat(np.asarray(q), scalar_first=True).as_matrix()
             for q in (fields.geom_quat[w, row], own.quat)
