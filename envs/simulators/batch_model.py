@@ -103,8 +103,8 @@ def body_fields(
         fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
 
     fields["geom_friction"] = fields["geom_friction"].at[:, :, 0].multiply(cells.friction[:, None])
-    slots = models.body_geometries(blank)
-    fields["geom_friction"] = fields["geom_friction"].at[:, slots, 0].multiply(cells.body_friction[..., None])
+    slots, factors = models.body_geometries(blank, shaped), cells.body_friction[:, shaped.start :, None]
+    fields["geom_friction"] = fields["geom_friction"].at[:, slots, 0].multiply(factors)
 
     def put(name: str, where: np.ndarray | int, value: Array) -> None:
         fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))

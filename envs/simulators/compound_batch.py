@@ -126,7 +126,7 @@ def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -
     )
     solids, matter = objects
     there = world.valid[:, :TARGET]
-    friction = cells.friction[:, None] * matter.friction
+    friction = cells.friction[:, None] * cells.body_friction[:, :TARGET] * matter.friction
     geoms = _geoms(blank)
     for name, rows in geoms.items():
         half, position, rotation, used = _rows(solids, there, name)

@@ -32,6 +32,7 @@ from mechsearch_jax.envs.world.body_model import (
     parking_place,
     text,
 )
+from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
