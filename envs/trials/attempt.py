@@ -47,7 +47,11 @@ EMPTY = 1e-3
 @functools.cache
 def blank_model(shelf: Shelf, timestep: float) -> mujoco.MjModel:
     """The model with empty slots, in which bodies at rest sleep; not to be changed."""
-    model = models.compile_model(shelf, Camera(), timestep)
+    return _sleepy(models.compile_model(shelf, Camera(), timestep))
+
+
+def _sleepy(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model, changed so that bodies at rest sleep."""
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     # Few bodies are awake at a time.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -62,7 +66,13 @@ class TrialScene(NativeWorld):
     """
 
     def __init__(
-        self, shelf: Shelf, config: SimulatorConfig, bodies: list[Body | None], friction: float = 1.0, mass: float = 1.0
+        self,
+        shelf: Shelf,
+        config: SimulatorConfig,
+        bodies: list[Body | None],
+        friction: float = 1.0,
+        mass: float = 1.0,
+        origins: Float[np.ndarray, "9 3"] | None = None,
     ):
         """Let bodies come to rest.
 
@@ -71,11 +81,13 @@ class TrialScene(NativeWorld):
           config: of the simulation.
           bodies: in their slots.
           friction, mass: factors on all sliding frictions, and on the bodies' masses.
+          origins: of the objects' frames in those of the bodies [m]; at the bodies' own if None.
 
         Raises:
           ValueError, mujoco.FatalError: MuJoCo cannot build the scene.
         """
         super().__init__(shelf, config=config, blank=blank_model(shelf, config.motion.timestep))
+        self._origins = np.zeros((BODIES, 3)) if origins is None else origins
         self.place(bodies, ActualCell(friction, mass))
         self._model.opt.sleep_tolerance = config.rest_speed
         self._hide_what_is_no_body()
@@ -129,7 +141,8 @@ class TrialScene(NativeWorld):
         if kind.returns_home or stopped:
             scene._go_home()
         scene._rest_again(np.empty((0, 0)))
-        places = scene._data.qpos[ROBOT:].reshape(BODIES, 7)[:, :3].copy()
+        poses = scene._data.qpos[ROBOT:].reshape(BODIES, 7)
+        places = poses[:, :3] + np.einsum("nij,nj->ni", rotation_matrix(poses[:, 3:]), self._origins)
         places[scene._fallen()] = np.inf
         if self.diverged or scene._recorder.diverged:
             places[:] = np.nan
@@ -170,10 +183,14 @@ class TrialScene(NativeWorld):
             return TrialResult.HARMFUL
         return TrialResult.FAILED if failed else TrialResult.SUCCEEDED
 
+    def _model_for(self, bodies: list[Body | None]) -> mujoco.MjModel:
+        model = super()._model_for(bodies)
+        return model if model is self._blank else _sleepy(model)
+
     def _hide_what_is_no_body(self) -> None:
         """Disable contacts of geometry in empty slots or hidden inside of a body."""
         for i, body in enumerate(self._bodies):
-            for shape in in_order():
+            for shape in () if body is not None and body.compound else in_order():
                 if body is None or body.shape != shape.name:
                     geom = self._model.geom(models.geometry_name(shape, i)).id
                     self._model.geom_contype[geom] = self._model.geom_conaffinity[geom] = 0

@@ -1,7 +1,8 @@
 """Trials in C MuJoCo, on several threads.
 
-The recognised objects become bodies as in `physics_push`, and a found target a body of its own shape; they come to
-rest, and the arm moves as in the environment. The environment's own simulator is not involved.
+The recognised objects become bodies as in `physics_push`, those of several parts compounds, and a found target a body
+of its own shape; they come to rest, and the arm moves as in the environment. The environment's own simulator is not
+involved.
 
 An approximation: what is not recognised, including a hidden target, is absent from the trials.
 """
@@ -29,6 +30,7 @@ from mechsearch_jax.envs.pushing.physics_push import bodies
 from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
+from mechsearch_jax.envs.trials.compounds import with_parts
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
@@ -42,6 +44,7 @@ from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, motions, program
 from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -169,7 +172,8 @@ class NativeTrials:
         objects = jax.tree.map(lambda a: a[row], scenes.objects)
         world = jax.device_get(_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
         friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
-        return world, _at_rest(cell.shelf, simulation, world, friction, mass)
+        made, origins = with_parts(bodies_of(world), objects)
+        return world, _at_rest(cell.shelf, simulation, made, origins, friction, mass)
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
@@ -201,10 +205,15 @@ def _world(
 
 
 def _at_rest(
-    shelf: Shelf, simulation: SimulatorConfig, world: World, friction: float, mass: float
+    shelf: Shelf,
+    simulation: SimulatorConfig,
+    made: list[Body | None],
+    origins: Float[np.ndarray, "9 3"],
+    friction: float,
+    mass: float,
 ) -> TrialScene | None:
     """A scene at rest; None if MuJoCo cannot build it, so that one invalid scene does not end the other trials."""
     try:
-        return TrialScene(shelf, simulation, bodies_of(world), friction, mass)
+        return TrialScene(shelf, simulation, made, friction, mass, origins)
     except (ValueError, mujoco.FatalError):
         return None

@@ -18,8 +18,7 @@ from scipy.spatial import HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import PRIMITIVES, shape_of
+from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import (
     COMPOUND,
     CONVEX,
@@ -33,8 +32,8 @@ from mechsearch_jax.shapes.compound import (
     inertial,
     solids,
 )
-from mechsearch_jax.shapes.parts import PARTS, parts_of
-from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.shapes.parts import part_rows
+from mechsearch_jax.workspace.scenario import Body, pieces_of
 
 # Most faces of a convex polyhedron: triangles between its vertices.
 FACES = 2 * MOST_VERTICES - 4
@@ -99,20 +98,6 @@ class Compounds(flax.struct.PyTreeNode):
     parts: Superquadrics
 
 
-def pieces_of(body: Body) -> Compound:
-    """What a body is made of; a plain one of the single piece that it is.
-
-    Raises:
-      InputError: it is of a shape that is no primitive.
-    """
-    if body.compound is not None:
-        return body.compound
-    shape = shape_of(body.shape)
-    if shape.name not in PRIMITIVES:
-        raise InputError(f"a {shape.name} cannot stand beside compounds: pieces are {', '.join(PRIMITIVES)}")
-    return Compound((Piece(shape.name, body.half_size),), shape.density, shape.friction)
-
-
 def compounds_of(bodies: Sequence[Body | None]) -> Compounds:
     """What the bodies in a world's slots are made of.
 
@@ -168,12 +153,7 @@ def _matter(compound: Compound | None) -> Any:
 
 @functools.lru_cache(maxsize=1024)
 def _parts(compound: Compound | None) -> Any:
-    parts = () if compound is None else parts_of(compound)
-    size, exponents = np.full((PARTS, 3), _NOTHING, np.float32), np.ones((PARTS, 2), np.float32)
-    position, rotation = np.zeros((PARTS, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (PARTS, 1, 1))
-    for i, part in enumerate(parts):
-        size[i], exponents[i], position[i], rotation[i] = part.size, part.exponents, part.position, part.rotation
-    return Superquadrics(size, exponents, position, rotation, np.arange(PARTS) < len(parts))  # pyright: ignore
+    return Superquadrics(*part_rows(compound))  # pyright: ignore[reportArgumentType]
 
 
 def body_of(host: Compounds, slot: int, pose: tuple[Sequence[float], Sequence[float]]) -> Body:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.world.compounds import Compounds, body_of, compounds_of, with_polyhedra
+from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import Shape, in_order, shape_of
@@ -156,7 +157,10 @@ def bodies_of(world: World) -> list[Body | None]:
 
 
 def superquadrics(world: World) -> Superquadrics:
-    """The true superquadrics of all bodies, the target last."""
+    """The true superquadrics of all bodies, the target last; of a world with compounds bodies of several parts."""
+    if isinstance(world, CompoundWorld):
+        scene = of_parts(world.compounds.parts, world.position, world.rotation)
+        return scene.replace(valid=scene.valid & world.valid)
     exponents = jnp.array([shape.exponents for shape in in_order()])
     return Superquadrics(world.half_size, exponents[world.kind], world.position, world.rotation, world.valid)
 

@@ -173,6 +173,19 @@ def parts_of(compound: Compound) -> tuple[Part, ...]:
     return tuple(parts)
 
 
+def part_rows(compound: Compound | None) -> tuple[np.ndarray, ...]:
+    """The parts as arrays of `PARTS` rows: size, exponents, position, rotation, and whether there is a part.
+
+    None has no parts.
+    """
+    parts = () if compound is None else parts_of(compound)
+    size, exponents = np.full((PARTS, 3), 1e-3, np.float32), np.ones((PARTS, 2), np.float32)
+    position, rotation = np.zeros((PARTS, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (PARTS, 1, 1))
+    for i, part in enumerate(parts):
+        size[i], exponents[i], position[i], rotation[i] = part.size, part.exponents, part.position, part.rotation
+    return size, exponents, position, rotation, np.arange(PARTS) < len(parts)
+
+
 def volume_in_common(compound: Compound) -> float:
     """Intersection over union of a compound's volume and that of its parts, on `2**16` even points."""
     whole = solids(compound.pieces)

@@ -18,11 +18,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import bodies_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import read_json, replacing
-from mechsearch_jax.shapes import SHAPES, shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, Compound, centred, half_extents
+from mechsearch_jax.shapes import PRIMITIVES, SHAPES, shape_of
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
+from mechsearch_jax.shapes.parts import part_rows
 from mechsearch_jax.workspace.compound_file import format_compound, is_compound, parse_compound
 from mechsearch_jax.workspace.json_checks import check_keys, check_norm, numbers
 from mechsearch_jax.workspace.shelf import Shelf
@@ -274,14 +276,16 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
 def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superquadrics:
     """Bodies as superquadrics with the planner's exponents, at their exact poses, in `capacity` slots.
 
-    A compound is the box about its centre of mass that contains it.
+    If there are compounds, all are bodies of parts.
 
     Raises:
       InputError: there are more bodies than slots.
     """
+    if any(body.compound for body in bodies):
+        return superquadric.pad(_of_parts(bodies), capacity)
     exact = Superquadrics(
         size=jnp.array([b.half_size for b in bodies], jnp.float32).reshape(-1, 3),
-        exponents=jnp.array([shape_of(_outer_shape(b)).exponents for b in bodies], jnp.float32).reshape(-1, 2),
+        exponents=jnp.array([shape_of(b.shape).exponents for b in bodies], jnp.float32).reshape(-1, 2),
         position=jnp.array([b.position for b in bodies], jnp.float32).reshape(-1, 3),
         rotation=jnp.array([rotation_matrix(b.quaternion) for b in bodies], jnp.float32).reshape(-1, 3, 3),
         valid=jnp.ones(len(bodies), bool),
@@ -289,8 +293,27 @@ def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superq
     return superquadric.pad(exact, capacity)
 
 
-def _outer_shape(body: Body) -> str:
-    return "box" if body.compound else body.shape
+def pieces_of(body: Body) -> Compound:
+    """What a body is made of; a plain one of the single piece that it is.
+
+    Raises:
+      InputError: it is of a shape that is no primitive.
+    """
+    if body.compound is not None:
+        return body.compound
+    shape = shape_of(body.shape)
+    if shape.name not in PRIMITIVES:
+        raise InputError(f"a {shape.name} cannot stand beside compounds: pieces are {', '.join(PRIMITIVES)}")
+    return Compound((Piece(shape.name, body.half_size),), shape.density, shape.friction)
+
+
+def _of_parts(bodies: Sequence[Body]) -> Superquadrics:
+    rows = [part_rows(pieces_of(body)) for body in bodies]
+    size, exponents, place, turn, valid = (jnp.array(np.stack(leaves)) for leaves in zip(*rows, strict=True))
+    parts = Superquadrics(size, exponents, place, turn, valid)
+    position = jnp.array([body.position for body in bodies], jnp.float32)
+    rotation = jnp.array([rotation_matrix(body.quaternion) for body in bodies], jnp.float32)
+    return bodies_of(parts, position, rotation)
 
 
 def example_scenarios() -> dict[str, Path]:

@@ -1,0 +1,82 @@
+"""Recognised bodies of several parts as compounds, in which actions are tried."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.envs.pushing.physics_push import THINNEST
+from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents, inertial
+from mechsearch_jax.workspace.scenario import Body
+
+# A round superquadric whose exponent e1 is above this is nearer to an ellipsoid than to a cylinder.
+SMOOTH_EXPONENT = 0.6
+
+
+def _piece(size: np.ndarray, exponents: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> Piece:
+    """The solid nearest to a part, in the frame of its body."""
+    half = np.maximum(size.astype(float), THINNEST)
+    shape = "box"
+    if exponents[1] > ROUND_EXPONENT:
+        shape = "ellipsoid" if exponents[0] > SMOOTH_EXPONENT else "cylinder"
+    if shape == "cylinder":
+        half = shape_of(shape).nearest(half, np)
+    quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    return Piece(shape, *(tuple(float(v) for v in values) for values in (half, position, quaternion)))  # pyright: ignore
+
+
+def compound_of(parts: Any) -> Compound:
+    """The compound of a body's parts, in the body's frame; as dense and rough as the environment's boxes and cylinders.
+
+    Args:
+      parts: a `Superquadrics` of a single body, as NumPy arrays; absent ones are left out.
+    """
+    there = np.flatnonzero(parts.valid)
+    rows = [(parts.size[i], parts.exponents[i], parts.position[i], parts.rotation[i]) for i in there]
+    pieces = tuple(_piece(*row) for row in rows)
+    shapes = [shape_of("box" if piece.shape == "box" else "cylinder") for piece in pieces]
+    volumes = [inertial(Compound((piece,), 1.0, 0.0)).mass for piece in pieces]
+    density = float(np.average([shape.density for shape in shapes], weights=volumes))
+    return Compound(pieces, density, max(shape.friction for shape in shapes))
+
+
+def with_parts(
+    bodies: Sequence[Body | None], objects: Superquadrics
+) -> tuple[list[Body | None], Float[np.ndarray, "9 3"]]:
+    """The bodies of recognised objects, with those of several parts as compounds.
+
+    Args:
+      bodies: in their slots, each the body nearest to an object's bounding superquadric.
+      objects: recognised, as NumPy arrays.
+
+    Returns:
+      The bodies, and where the origin of each object's frame is in the frame of its body [m].
+    """
+    made, origins = list(bodies), np.zeros((BODIES, 3))
+    parts: Any = objects.parts
+    if parts is None:
+        return made, origins
+    for i in np.flatnonzero(objects.valid & (parts.valid.sum(axis=-1) > 1)):
+        own: Any = Superquadrics(*(getattr(parts, name)[i] for name in _FIELDS))
+        compound, centre = centred(compound_of(own))
+        body = made[i]
+        assert body is not None
+        position = np.asarray(objects.position[i], float) + np.asarray(objects.rotation[i], float) @ centre
+        x, y, z = position.tolist()
+        made[i] = dataclasses.replace(
+            body, shape=COMPOUND, half_size=half_extents(compound), position=(x, y, z), compound=compound
+        )
+        origins[i] = -centre
+    return made, origins
+
+
+_FIELDS = ("size", "exponents", "position", "rotation", "valid")

@@ -1,0 +1,98 @@
+"""Compounds as the planner sees them, bodies of several parts, and as trials make them compounds again."""
+
+import jax
+import numpy as np
+import pytest
+
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle
+from mechsearch_jax.envs.pushing import physics_push
+from mechsearch_jax.envs.scenes.household import body_at, household, standing_height
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
+from mechsearch_jax.envs.trials.attempt import TrialScene
+from mechsearch_jax.envs.trials.compounds import compound_of, with_parts
+from mechsearch_jax.envs.world import world
+from mechsearch_jax.envs.world.world import BODIES, TARGET, bodies_of, from_scenario
+from mechsearch_jax.geometry.bodies import world_parts
+from mechsearch_jax.shapes.compound import half_extents, inertial
+from mechsearch_jax.shapes.parts import parts_of
+from mechsearch_jax.workspace import scenario as scenarios
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+BOX = Body("box", (0.054, 0.025, 0.054), (0.55, 0.35, 0.4585), UPRIGHT)
+TARGET_BODY = Body("cylinder", (0.02, 0.02, 0.05), (0.7, 0.0, 0.4545), UPRIGHT)
+
+
+def standing(name, y, yaw=0.7):
+    compound = household()[name].compound
+    return body_at(compound, 0.6, y, Shelf().board + standing_height(compound), yaw)
+
+
+SCENE = Scenario("things", (standing("mug", 0.0), standing("drill", 0.18), BOX), TARGET_BODY)
+
+
+def in_world(body):
+    """Position and size of every part of a compound, in the world."""
+    turn = scenarios.rotation_matrix(body.quaternion)
+    return {
+        tuple(np.round(np.array(body.position) + turn @ part.position, 5)): part for part in parts_of(body.compound)
+    }
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        scenarios.superquadrics(SCENE.objects),
+        world.true_superquadrics(from_scenario(SCENE)),
+        oracle(jax.random.key(0), Snapshot(Camera(), Shelf(), from_scenario(SCENE))).objects,
+    ],
+    ids=["scenario", "world", "oracle"],
+)
+def test_true_shapes_are_bodies_of_the_parts(scene):
+    assert scene.capacity == MAX_OBJECTS
+    assert scene.valid.tolist() == [True] * 3 + [False] * 5
+    assert scene.parts.valid.sum(axis=1).tolist()[:3] == [4, 4, 1]
+    parts = world_parts(scene)
+    count = scene.parts.capacity
+    for i in range(2):
+        wanted = in_world(SCENE.objects[i])
+        for p in range(i * count, (i + 1) * count):
+            place = min(wanted, key=lambda place: np.linalg.norm(place - np.asarray(parts.position[p])))
+            np.testing.assert_allclose(parts.position[p], place, atol=1e-4)
+            np.testing.assert_allclose(np.sort(parts.size[p]), np.sort(wanted[place].size), atol=1e-6)
+    np.testing.assert_allclose(scene.size[2], BOX.half_size, atol=1e-6)
+    np.testing.assert_allclose(scene.position[2], BOX.position, atol=1e-6)
+
+
+def test_a_scene_without_compounds_has_no_parts():
+    assert scenarios.superquadrics((BOX,)).parts is None
+    assert world.true_superquadrics(from_scenario(Scenario("plain", (BOX,), TARGET_BODY))).parts is None
+
+
+def test_parts_become_a_compound_of_their_volume():
+    body = SCENE.objects[0]
+    scene = jax.device_get(scenarios.superquadrics(SCENE.objects))
+    made = compound_of(jax.tree.map(lambda leaf: leaf[0], scene.parts))
+    assert [piece.shape for piece in made.pieces] == ["cylinder", "box", "box", "box"]
+    volume = inertial(made).mass / made.density
+    assert volume == pytest.approx(inertial(body.compound).mass / body.compound.density, rel=1e-4)
+    assert 585.0 <= made.density <= 737.0
+    assert made.friction == 0.6
+
+
+def test_things_rest_in_a_trial_where_they_were_recognised():
+    objects = jax.device_get(objects_on_the_board(Snapshot(Camera(), Shelf(), from_scenario(SCENE))))
+    boxes = bodies_of(physics_push.bodies(objects))
+    boxes[TARGET] = TARGET_BODY
+    bodies, origins = with_parts(boxes, objects)
+    assert [body and body.shape for body in bodies] == ["compound", "compound", "box", *[None] * 5, "cylinder"]
+    np.testing.assert_allclose(bodies[0].half_size, half_extents(bodies[0].compound))
+    trial = TrialScene(Shelf(), SimulatorConfig(), bodies, origins=origins)
+    assert not trial.diverged
+    poses = trial.positions[9:].reshape(BODIES, 7)
+    there = poses[:, :3] + np.einsum("nij,nj->ni", scenarios.rotation_matrix(poses[:, 3:]), origins)
+    np.testing.assert_allclose(there[:2], objects.position[:2], atol=2e-3)
+    np.testing.assert_allclose(there[TARGET], TARGET_BODY.position, atol=2e-3)
+    assert not trial.fallen.any()
