@@ -44,7 +44,6 @@ from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, motions, program
 from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -172,8 +171,7 @@ class NativeTrials:
         objects = jax.tree.map(lambda a: a[row], scenes.objects)
         world = jax.device_get(_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
         friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
-        made, origins = with_parts(bodies_of(world), objects)
-        return world, _at_rest(cell.shelf, simulation, made, origins, friction, mass)
+        return world, _at_rest(cell.shelf, simulation, world, objects, friction, mass)
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
@@ -207,13 +205,14 @@ def _world(
 def _at_rest(
     shelf: Shelf,
     simulation: SimulatorConfig,
-    made: list[Body | None],
-    origins: Float[np.ndarray, "9 3"],
+    world: World,
+    objects: Superquadrics,
     friction: float,
     mass: float,
 ) -> TrialScene | None:
     """A scene at rest; None if MuJoCo cannot build it, so that one invalid scene does not end the other trials."""
     try:
+        made, origins = with_parts(bodies_of(world), objects)
         return TrialScene(shelf, simulation, made, friction, mass, origins)
     except (ValueError, mujoco.FatalError):
         return None
