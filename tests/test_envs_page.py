@@ -21,10 +21,11 @@ from mechsearch_jax.envs.page import page as pages
 from mechsearch_jax.envs.page.ending import ending, executed_words, plain
 from mechsearch_jax.envs.page.page import RECORD, page, recording_with_record
 from mechsearch_jax.envs.page.pictures import hidden_behind, last_world
-from mechsearch_jax.envs.page.steps import shapes
-from mechsearch_jax.envs.recording.evidence import Evidence, Forecasts
+from mechsearch_jax.envs.page.steps import candidates, shapes
+from mechsearch_jax.envs.recording.evidence import Evidence, Forecasts, foreseen_rows
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
+from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision, initial_belief
@@ -47,7 +48,7 @@ def evidence(found=False, hits=((0,), (0, 2)), tried=None):
         confidence=np.where(np.asarray(OBJECTS.valid), np.float32(0.9), np.float32(0.0)),
         believed_pose=np.array([0.62, 0.07, 0.0], np.float32) if found else np.full(3, np.nan, np.float32),
         hits=table,
-        forecasts=Forecasts(everywhere, level, np.array([1, 2] if found else [-1, -1], np.int32)),
+        forecasts=Forecasts(np.arange(2), everywhere, level, np.array([1, 2] if found else [-1, -1], np.int32)),
         tried=tried or nothing_tried(),
     )
 
@@ -164,6 +165,45 @@ def test_a_step_shows_the_decision_beside_the_runner_up(text):
     assert "runner-up: push object 0 by 20 cm" in sentences
     assert f"Predicted: f at {POSES} poses, graspable at {POSES}, J 90. Its sequence changes J by -30.0" in sentences
     assert "J: 100 before, 60 expected, 95 observed. It came out worse than expected." in sentences
+
+
+def of_objects(*objects):
+    """Candidates that move these objects, the best first; all else is alike."""
+    count = len(objects)
+    action = stacked(*(PUSH.replace(object=np.int32(i), q7=np.float32(k)) for k, i in enumerate(objects)))
+    positions, rotations = (np.stack([np.asarray(a)] * count) for a in (OBJECTS.position, OBJECTS.rotation))
+    return Sampled(action, -np.arange(count, 0.0, -1), np.full(count, 90.0), positions, rotations)
+
+
+def test_the_best_candidate_that_moves_another_object_is_shown_and_foreseen():
+    several = of_objects(0, 0, 2, 3)
+    assert foreseen_rows(several) == [0, 1, 2]
+    assert foreseen_rows(of_objects(0, 2, 0)) == [0, 1]
+    assert foreseen_rows(of_objects(0)) == [0]
+    everywhere = np.ones((3, POSES), bool)
+    everywhere[2, 5:] = False
+    forecasts = Forecasts(np.array([0, 1, 2]), everywhere, np.ones((3, POSES), int), np.full(3, -1, np.int32))
+    chosen = dataclasses.replace(
+        STEPS[0],
+        sampled=several,
+        action=several.single(0),
+        evidence=dataclasses.replace(evidence(), forecasts=forecasts),
+    )
+    shown = candidates(chosen)
+    assert [(c.role, c.row) for c in shown] == [("chosen", 0), ("runner-up", 1), ("best of another object", 2)]
+    assert shown[2].belief == "f at 5 poses, graspable at 5"
+    assert shown[2].words.startswith("push object 2")
+    two = dataclasses.replace(chosen, sampled=of_objects(0, 2))
+    assert [c.role for c in candidates(two)] == ["chosen", "runner-up"]
+
+
+def test_forecasts_of_an_earlier_version_are_of_the_best_candidates(tmp_path):
+    save_recording(LOST, tmp_path / NAME)
+    with np.load(tmp_path / NAME) as file:
+        arrays = {name: file[name] for name in file if not name.startswith("evidence.foreseen.row")}
+    np.savez(tmp_path / NAME, **arrays)
+    again = load_recording(tmp_path / NAME)
+    assert [step.evidence.forecasts.row.tolist() for step in again.steps] == [[0, 1]] * 2
 
 
 def test_a_step_says_what_trials_came_to_and_what_perception_saw(text):

@@ -8,23 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import jinja2
 import numpy as np
 
 from mechsearch_jax.actions import kind_of
-from mechsearch_jax.envs.camera.snapshot import true_target_pose
-from mechsearch_jax.envs.episode.episode_log import target_trouble
-from mechsearch_jax.envs.episode.records import Step, load_episode
-from mechsearch_jax.envs.known_target.in_the_way import blocking
+from mechsearch_jax.envs.episode.records import load_episode
 from mechsearch_jax.envs.page import steps as texts
-from mechsearch_jax.envs.page.ending import action_words, ending, executed_words, plain
-from mechsearch_jax.envs.page.pictures import Painter, last_world, objects_of
-from mechsearch_jax.envs.recording.narration import events, verdict
+from mechsearch_jax.envs.page.ending import action_words, ending, executed_words
+from mechsearch_jax.envs.page.pictures import Painter, data_uri
+from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
-from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, is_file, replacing
 from mechsearch_jax.viz import drawing
@@ -97,23 +91,15 @@ def stamp() -> str:
 
 
 def _card(recording: Recording, painter: Painter) -> dict[str, Any]:
-    end, last = ending(recording), recording.steps[-1]
-    world = last_world(last)
-    scene = objects_of(world, recording.camera, recording.shelf)
-    upright = (
-        target_trouble(recording.shelf, *(np.asarray(a)[TARGET] for a in (world.position, world.rotation))) is None
-    )
-    stands = upright and not (recording.episode is not None and recording.episode.retrieved)
-    pose = np.asarray(true_target_pose(jax.tree.map(jnp.asarray, world))) if stands else None
-    blockers = [i for i in end.blockers if scene.valid[i]]
-    seen, above = painter.end(world, scene, pose, blockers)
+    end = ending(recording)
+    last = painter.end(end.blockers)
     return {
         **end._asdict(),
-        "stands": stands,
+        "stands": last.stands,
         "facts": _facts(recording),
-        "seen": seen,
-        "above": above,
-        "blockers": blockers,
+        "seen": data_uri(last.seen),
+        "above": data_uri(last.above),
+        "blockers": last.blockers,
     }
 
 
@@ -160,7 +146,7 @@ def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
     frame = recorded_frame(step, recording.camera, recording.shelf)
     candidates = texts.candidates(step)
     shapes = texts.shapes(recording, step, frame.owner)
-    blocked = _blocked(step)
+    blocked = texts.blocked(step)
     sure = np.full(step.scene.capacity, np.nan) if step.evidence is None else step.evidence.confidence
     return {
         "number": i + 1,
@@ -171,19 +157,19 @@ def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
         "found": step.found,
         "blocked": bool(blocked),
         "belief": texts.poses_in_words(step, before),
-        "truth": _truth(step, record),
+        "truth": texts.truth(step, record),
         "grasps": texts.grasps_words(step),
-        "seen": painter.seen(frame),
-        "map": painter.believed(step, frame, before, blocked),
-        "candidates": [{**c._asdict(), "picture": painter.foreseen(step, c.row)} for c in candidates],
+        "seen": data_uri(painter.seen(frame)),
+        "map": data_uri(painter.believed(step, frame, before, blocked)),
+        "candidates": [{**c._asdict(), "picture": data_uri(painter.foreseen(step, c.row))} for c in candidates],
         "sampled": len(step.sampled),
         "retrieves": step.action is not None and kind_of(int(step.action.kind)).takes_target,
         "trials": texts.trials(step),
         "shapes": shapes,
-        "recognised": painter.recognised(step, frame, sure) if shapes else None,
+        "recognised": data_uri(painter.recognised(step, frame, sure)) if shapes else None,
         "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,
         "costs": texts.costs(recording, i),
-        "troubles": [] if record is None else [*([plain(record.failure)] if record.failure else []), *events(record)],
+        "troubles": texts.troubles(record),
         **_counts(step),
     }
 
@@ -192,21 +178,3 @@ def _counts(step: RecordedStep) -> Mapping[str, int]:
     """Numbers of poses for the time line."""
     size = 1 if step.found else int(step.existence.sum())
     return {"size": size, "good": texts.graspable(step.existence, step.graspability)}
-
-
-def _blocked(step: RecordedStep) -> tuple[int, ...]:
-    """The recognised objects that block a found target."""
-    if step.evidence is None or not step.found or not len(step.evidence.hits):
-        return ()
-    return tuple(i for i in blocking(step.evidence.hits) if step.scene.valid[i])
-
-
-def _truth(step: RecordedStep, record: Step | None) -> str:
-    """Whether the belief holds the truth."""
-    if texts.believed_elsewhere(step):
-        return "It is not the target."
-    if record is None or record.truth_possible is None:
-        return ""
-    if record.truth_possible:
-        return "The true pose is among the possible ones."
-    return "The true pose is not among the possible ones: the belief is wrong."

@@ -1,10 +1,11 @@
-"""The pictures of an episode's page, as data URIs: what the camera saw, and the shelf from above."""
+"""The pictures of an episode's page: what the camera saw, and the shelf from above."""
 
 from __future__ import annotations
 
 import base64
 import io
 from collections.abc import Callable, Collection
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.recording.pictures import colour_image
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.recording.sampled import Sampled
@@ -39,6 +41,24 @@ SURE, DOUBTFUL = 0.8, 0.5
 RULED_OUT, REOPENED = "#9aa5ae", drawing.ACTION
 
 
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+class End(NamedTuple):
+    """How the shelf looks at the end.
+
+    Attributes:
+      seen, above: in the camera's view and from above.
+      stands: whether the target still stands on the board.
+      blockers: the objects on the board that are marked as in its way.
+    """
+
+    seen: Picture
+    above: Picture
+    stands: bool
+    blockers: tuple[int, ...]
+
+
 class Painter:
     """Draws the pictures of one recording at one scale."""
 
@@ -46,18 +66,19 @@ class Painter:
         """Args:
         recording: of the episode.
         """
+        self._recording = recording
         self._camera: Camera = recording.camera
         self._shelf: Shelf = recording.shelf
         self._target: Target = recording.target
         scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
         self._room = drawing.height_of(scenes, recording.shelf)
 
-    def seen(self, frame: Frame) -> str:
+    def seen(self, frame: Frame) -> Picture:
         """What the camera saw at a step, with the action."""
         camera, shelf = self._camera, self._shelf
         return self._view(lambda axes: draw_seen(axes, frame, camera, shelf, self._target, self._room))
 
-    def recognised(self, step: RecordedStep, frame: Frame, confidence: Float[np.ndarray, " n"]) -> str:
+    def recognised(self, step: RecordedStep, frame: Frame, confidence: Float[np.ndarray, " n"]) -> Picture:
         """The outlines of the recognised shapes over what the camera saw, coloured by how sure recognition is."""
 
         def draw(axes: Axes) -> None:
@@ -66,8 +87,8 @@ class Painter:
                 if outline is None:
                     continue
                 sure = float(confidence[i])
-                colour = drawing.TARGET if sure < DOUBTFUL else drawing.BLOCKED[1] if sure < SURE else drawing.ACTION
-                axes.add_patch(patches.Polygon(outline, closed=True, facecolor="none", edgecolor=colour, linewidth=1.6))
+                style = {"facecolor": "none", "edgecolor": colour_of(sure), "linewidth": 1.6}
+                axes.add_patch(patches.Polygon(outline, closed=True, **style))
                 x, y = outline.mean(axis=0)
                 text = drawing.number(axes, (float(x), float(y)), i)
                 # More would cover what it is about.
@@ -76,7 +97,9 @@ class Painter:
 
         return self._view(draw)
 
-    def believed(self, step: RecordedStep, frame: Frame, before: RecordedStep | None, blockers: Collection[int]) -> str:
+    def believed(
+        self, step: RecordedStep, frame: Frame, before: RecordedStep | None, blockers: Collection[int]
+    ) -> Picture:
         """f and g from above, what changed since the step before, the objects, the target's true pose, the action."""
 
         def draw(axes: Axes) -> None:
@@ -86,19 +109,21 @@ class Painter:
             mark_from_above(axes, step.scene, blockers)
             flat = sketches.from_above
             sketches.draw_action(axes, flat, frame.sketch, step.scene, step.after, self._shelf)
-            sketches.draw_taken_target(axes, flat, frame.sketch, step.target_pose, self._target, self._shelf)
+            if is_known(step.target_pose):
+                sketches.draw_taken_target(axes, flat, frame.sketch, step.target_pose, self._target, self._shelf)
 
         return self._above(draw)
 
-    def foreseen(self, step: RecordedStep, k: int) -> str:
+    def foreseen(self, step: RecordedStep, k: int) -> Picture:
         """f and g from above as predicted after a candidate, the objects there, and the action."""
         candidates: Sampled = step.sampled
         after = candidates.after(k, step.scene)
 
         def draw(axes: Axes) -> None:
             forecasts = None if step.evidence is None else step.evidence.forecasts
-            if forecasts is not None and k < len(forecasts):
-                self._map(axes, step, forecasts.existence[k], forecasts.graspability[k], after)
+            row = None if forecasts is None else forecasts.of(k)
+            if forecasts is not None and row is not None:
+                self._map(axes, step, forecasts.existence[row], forecasts.graspability[row], after)
             else:
                 self._map(axes, step, np.zeros_like(step.existence), step.graspability, after)
             sketch = sampled_sketch(step, k)
@@ -106,17 +131,19 @@ class Painter:
 
         return self._above(draw)
 
-    def end(
-        self, world: World, scene: Superquadrics, pose: np.ndarray | None, blockers: Collection[int]
-    ) -> tuple[str, str]:
-        """The true state in the camera's view and from above, with the objects in the way marked.
+    def end(self, blocking: Collection[int]) -> End:
+        """The true state at the end in the camera's view and from above, with the objects in the way marked.
 
         Args:
-          world: the state.
-          scene: its objects.
-          pose: x, y [m] and yaw [rad] of the target; None if it does not stand on the board.
-          blockers: indices of the objects in the way.
+          blocking: indices of the objects in the way; those that are no longer on the board are not marked.
         """
+        world = last_world(self._recording.steps[-1])
+        scene = objects_of(world, self._camera, self._shelf)
+        body = (np.asarray(a)[TARGET] for a in (world.position, world.rotation))
+        episode, upright = self._recording.episode, target_trouble(self._shelf, *body) is None
+        stands = upright and not (episode is not None and episode.retrieved)
+        pose = np.asarray(true_target_pose(jax.tree.map(jnp.asarray, world))) if stands else None
+        blockers = tuple(i for i in blocking if scene.valid[i])
         image = Snapshot(self._camera, self._shelf, jax.tree.map(jnp.asarray, world)).image
         owner, somewhere = np.asarray(image.segmentation), np.zeros(3) if pose is None else pose
         moment = Moment("", colour_image(image), owner, scene, somewhere, blockers)
@@ -133,7 +160,7 @@ class Painter:
                 drawing.draw_target(axes, pose, self._target, certain=True)
             mark_from_above(axes, scene, blockers)
 
-        return self._view(seen), self._above(above)
+        return End(self._view(seen), self._above(above), stands, blockers)
 
     def _map(
         self,
@@ -146,7 +173,8 @@ class Painter:
         drawing.draw_shelf(axes, self._shelf)
         drawing.draw_map(axes, drawing.map_image(existence, graspability, self._target), self._shelf, self._target)
         drawing.draw_objects(axes, scene)
-        drawing.draw_target(axes, step.target_pose, self._target, step.found)
+        if is_known(step.target_pose):
+            drawing.draw_target(axes, step.target_pose, self._target, step.found)
 
     def _changes(self, axes: Axes, before: Bool[np.ndarray, " x"], now: Bool[np.ndarray, " x"]) -> None:
         """Mark the cells in which the target could be before and no more, or the other way round."""
@@ -157,12 +185,22 @@ class Painter:
             x, y = places[cells].T
             axes.scatter(y, x, s=11, c=colour, marker=mark, linewidths=1.0, zorder=2)
 
-    def _view(self, draw: Callable[[Axes], None]) -> str:
+    def _view(self, draw: Callable[[Axes], None]) -> Picture:
         left, right, top, bottom = drawing.view_window(self._camera, self._shelf, self._room)
-        return data_uri(_drawn((bottom - top) / (right - left), draw))
+        return _drawn((bottom - top) / (right - left), draw)
 
-    def _above(self, draw: Callable[[Axes], None]) -> str:
-        return data_uri(_drawn(drawing.map_share(self._shelf), draw))
+    def _above(self, draw: Callable[[Axes], None]) -> Picture:
+        return _drawn(drawing.map_share(self._shelf), draw)
+
+
+def colour_of(sure: float) -> str:
+    """The colour of a recognised shape by how sure recognition is; blue where nothing says so."""
+    return drawing.TARGET if sure < DOUBTFUL else drawing.BLOCKED[1] if sure < SURE else drawing.ACTION
+
+
+def is_known(target_pose: Float[np.ndarray, " 3"]) -> bool:
+    """Whether a target's pose is known to whoever draws it."""
+    return bool(np.isfinite(target_pose).all())
 
 
 def hidden_behind(step: RecordedStep, camera: Camera, shelf: Shelf) -> list[tuple[int, float]]:
@@ -197,14 +235,14 @@ def objects_of(world: World, camera: Camera, shelf: Shelf) -> Superquadrics:
     return jax.tree.map(np.asarray, objects_on_the_board(snapshot))
 
 
-def data_uri(picture: UInt8[np.ndarray, "h w 3"]) -> str:
+def data_uri(picture: Picture) -> str:
     """A picture as WebP in a data URI."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format="WEBP", quality=QUALITY, method=5)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
-def _drawn(share: float, draw: Callable[[Axes], None]) -> UInt8[np.ndarray, "h w 3"]:
+def _drawn(share: float, draw: Callable[[Axes], None]) -> Picture:
     """A picture whose height is a share of its width."""
     figure = Figure(figsize=(WIDTH, WIDTH * share), dpi=DPI, facecolor=drawing.PAPER)
     canvas = FigureCanvasAgg(figure)

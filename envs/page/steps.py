@@ -11,9 +11,11 @@ from jaxtyping import Int
 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot
-from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words
-from mechsearch_jax.envs.page.ending import action_words, believed_elsewhere, counted, free, same_action
+from mechsearch_jax.envs.episode.records import Step
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words
+from mechsearch_jax.envs.page.ending import action_words, believed_elsewhere, counted, free, plain, same_action
 from mechsearch_jax.envs.page.pictures import objects_of
+from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.observation import Observation
@@ -35,10 +37,10 @@ WRONG = 0.02
 
 
 class Candidate(NamedTuple):
-    """One of the two best candidates of a decision.
+    """One of the best candidates of a decision.
 
     Attributes:
-      role: "chosen" or "runner-up".
+      role: "chosen", "runner-up", or "best of another object".
       words: the action.
       value, cost: equation 2 of its sequence, and predicted J after it.
       belief: predicted f and g in words; empty if not recorded.
@@ -107,12 +109,19 @@ def grasps_words(step: RecordedStep) -> str:
 
 
 def candidates(step: RecordedStep) -> list[Candidate]:
-    """The chosen action and the runner-up; none where nothing was chosen, or no sequences were compared."""
+    """The chosen action, the runner-up, and the best action that moves another object if the runner-up does not.
+
+    None where nothing was chosen, or no sequences were compared.
+    """
     if step.action is None or not kind_of(int(step.action.kind)).moves_object:
         return []
-    chosen = [k for k in range(len(step.sampled)) if same_action(step, step.sampled.action, k)][:1]
-    others = [k for k in range(len(step.sampled)) if k not in chosen][:1]
-    return [_candidate(step, role, k) for role, rows in (("chosen", chosen), ("runner-up", others)) for k in rows]
+    every = range(len(step.sampled))
+    chosen = [k for k in every if same_action(step, step.sampled.action, k)][:1]
+    others = [k for k in every if k not in chosen][:1]
+    moved = step.sampled.action.object
+    elsewhere = [k for k in every if moved[k] != step.action.object][:1]
+    roles = {"chosen": chosen, "runner-up": others, "best of another object": [k for k in elsewhere if k not in others]}
+    return [_candidate(step, role, k) for role, rows in roles.items() for k in rows]
 
 
 def _candidate(step: RecordedStep, role: str, k: int) -> Candidate:
@@ -129,14 +138,15 @@ def number(cost: float) -> str:
 
 def _forecast(step: RecordedStep, k: int) -> str:
     forecasts = None if step.evidence is None else step.evidence.forecasts
-    if forecasts is None or k >= len(forecasts):
+    row = None if forecasts is None else forecasts.of(k)
+    if forecasts is None or row is None:
         return ""
-    least = int(forecasts.in_the_way[k])
+    least = int(forecasts.in_the_way[row])
     if least == INFEASIBLE:
         return "no grasp would be possible"
     if least >= 0:
         return "a grasp would be free" if least == 0 else f"the best grasp would hit {counted(least, 'object')}"
-    exists, g = forecasts.existence[k], forecasts.graspability[k]
+    exists, g = forecasts.existence[row], forecasts.graspability[row]
     return f"f at {counted(int(exists.sum()), 'pose')}, graspable at {graspable(exists, g)}"
 
 
@@ -164,6 +174,29 @@ def trials(step: RecordedStep) -> list[Trial]:
     # Grasps of the target are alike in words.
     alike = [(row, len(list(group))) for row, group in itertools.groupby(rows)]
     return [row._replace(words=f"{row.words}, {count} ways") if count > 1 else row for row, count in alike]
+
+
+def truth(step: RecordedStep, record: Step | None) -> str:
+    """Whether the belief holds the truth; empty if that is not recorded."""
+    if believed_elsewhere(step):
+        return "It is not the target."
+    if record is None or record.truth_possible is None:
+        return ""
+    if record.truth_possible:
+        return "The true pose is among the possible ones."
+    return "The true pose is not among the possible ones: the belief is wrong."
+
+
+def blocked(step: RecordedStep) -> tuple[int, ...]:
+    """The recognised objects that the best grasps of a found target hit."""
+    if step.evidence is None or not step.found or not len(step.evidence.hits):
+        return ()
+    return tuple(i for i in blocking(step.evidence.hits) if step.scene.valid[i])
+
+
+def troubles(record: Step | None) -> list[str]:
+    """What went wrong at a step."""
+    return [] if record is None else [*([plain(record.failure)] if record.failure else []), *events(record)]
 
 
 def shapes(recording: Recording, step: RecordedStep, owner: Int[np.ndarray, "h w"]) -> list[Shape]:

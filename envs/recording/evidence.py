@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions import Action, ActionKind, kind_of, no_action
 from mechsearch_jax.envs.camera.snapshot import objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.episode.moments import Moment, TriedActions, nothing_tried
-from mechsearch_jax.envs.recording.sampled import sampled
+from mechsearch_jax.envs.recording.sampled import Sampled, sampled
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import INFEASIBLE
@@ -28,26 +28,33 @@ from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.session.preparing import Program, nothing_seen, program
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
-# Of so many of the best candidates the predicted f and g are kept: the chosen one and the runner-up.
+# Of so many of the best candidates the predicted f and g are kept, and of the best that moves another object.
 FORESEEN = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Forecasts:
-    """f and g as they are predicted after each of the first M candidates of a decision; NumPy arrays.
+    """f and g as they are predicted after M of the candidates of a decision; NumPy arrays.
 
     Attributes:
+      row: index of the candidate among those of the decision, shape (M,).
       existence: f, shape (M, X); nowhere once the target is found.
       graspability: g, shape (M, X).
       in_the_way: number of objects that the best grasp of a found target hits, shape (M,); -1 if it is not found.
     """
 
+    row: Int[np.ndarray, " m"]
     existence: Bool[np.ndarray, "m x"]
     graspability: Int[np.ndarray, "m x"]
     in_the_way: Int[np.ndarray, " m"]
 
     def __len__(self) -> int:
         return len(self.in_the_way)
+
+    def of(self, candidate: int) -> int | None:
+        """The index of the forecast of a candidate; None if there is none."""
+        rows = np.flatnonzero(self.row == candidate)
+        return int(rows[0]) if len(rows) else None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,9 +117,22 @@ def _forecasts(moment: Moment, problem: Problem) -> Forecasts:
     if candidates is None or not len(candidates) or not len(candidates.position):
         return nothing_foreseen(len(problem.poses))
     objects = jax.tree.map(np.asarray, moment.observation.objects)
-    rows = [_forecast(moment, problem, candidates.after(k, objects)) for k in range(min(FORESEEN, len(candidates)))]
-    exists, g, least = zip(*rows, strict=True)
-    return Forecasts(np.stack(exists), np.stack(g), np.array(least, np.int32))
+    rows = foreseen_rows(candidates)
+    forecasts = [_forecast(moment, problem, candidates.after(k, objects)) for k in rows]
+    exists, g, least = zip(*forecasts, strict=True)
+    return Forecasts(np.array(rows), np.stack(exists), np.stack(g), np.array(least, np.int32))
+
+
+def foreseen_rows(candidates: Sampled) -> list[int]:
+    """The candidates whose f and g are predicted: the best ones, and the best that moves another object."""
+    best = list(range(min(FORESEEN, len(candidates))))
+    return best + [k for k in (of_another_object(candidates),) if k is not None and k not in best]
+
+
+def of_another_object(candidates: Sampled) -> int | None:
+    """The best candidate that moves another object than the best one; None if there is none."""
+    others = np.flatnonzero(candidates.action.object != candidates.action.object[:1])
+    return int(others[0]) if len(others) else None
 
 
 def _forecast(moment: Moment, problem: Problem, after: Superquadrics) -> tuple[np.ndarray, np.ndarray, int]:
@@ -134,7 +154,9 @@ def _forecast(moment: Moment, problem: Problem, after: Superquadrics) -> tuple[n
 
 def nothing_foreseen(poses: int) -> Forecasts:
     """No candidates."""
-    return Forecasts(np.zeros((0, poses), bool), np.zeros((0, poses), np.int32), np.zeros(0, np.int32))
+    return Forecasts(
+        np.zeros(0, int), np.zeros((0, poses), bool), np.zeros((0, poses), np.int32), np.zeros(0, np.int32)
+    )
 
 
 def no_evidence(poses: int) -> Evidence:
@@ -181,6 +203,8 @@ def unpacked(arrays: Mapping[str, np.ndarray], steps: int, poses: int) -> list[E
     if "evidence.known" not in arrays:
         return [None] * steps
     empty = no_evidence(poses)
+    if "evidence.foreseen.row" not in arrays:
+        arrays = {**arrays, **_first_rows(arrays, steps)}
     recorded = _checked(arrays, "known", (steps,), np.dtype(bool))
     confidence = _checked(arrays, "confidence", (steps, *empty.confidence.shape), np.dtype(float), finite=False)
     believed = _checked(arrays, "believed_pose", (steps, 3), np.dtype(float), finite=False)
@@ -196,9 +220,16 @@ def unpacked(arrays: Mapping[str, np.ndarray], steps: int, poses: int) -> list[E
     return result
 
 
+def _first_rows(arrays: Mapping[str, np.ndarray], steps: int) -> dict[str, np.ndarray]:
+    """The candidates that an earlier version predicted f and g of: always the best ones."""
+    counts = _checked(arrays, "foreseen.in_the_way.rows", (steps,), np.dtype(int))
+    rows = [np.arange(count) for count in counts.clip(0, FORESEEN).tolist()]
+    return {"evidence.foreseen.row": np.concatenate(rows), "evidence.foreseen.row.rows": counts}
+
+
 def _check_step(tried: TriedActions, foreseen: Forecasts) -> None:
     counts = {len(getattr(tried.action, field.name)) for field in dataclasses.fields(Action)} | {len(tried.result)}
-    if len(counts) > 1 or len({len(foreseen.existence), len(foreseen.graspability), len(foreseen.in_the_way)}) > 1:
+    if len(counts) > 1 or len({len(getattr(foreseen, field.name)) for field in dataclasses.fields(Forecasts)}) > 1:
         raise ValueError("trials or forecasts are missing")
     for kind, result in zip(tried.action.kind.tolist(), tried.result.tolist(), strict=True):
         if kind_of(kind).code == ActionKind.NONE or result not in iter(TrialResult):
