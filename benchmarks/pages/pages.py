@@ -10,7 +10,7 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jinja2
 import markupsafe
@@ -94,7 +94,41 @@ class Table:
             return self.cells.to_html(index=False, border=0, classes=f"texts{self.texts}")
 
 
-Block = Heading | Paragraph | Table | Picture | Link
+class Mark(NamedTuple):
+    """A cell of a matrix.
+
+    Attributes:
+      kind: what it stands for.
+      text: in it, a few letters.
+      colour: as HTML has it.
+      file: beside the page, which a click opens; empty without one.
+    """
+
+    kind: str
+    text: str
+    colour: str
+    file: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Matrix:
+    """A map of coloured cells, which the HTML page alone shows.
+
+    Attributes:
+      columns: their headings.
+      lines: the heading of each line, and its cells; None for an empty one.
+      legend: colours, and what they stand for.
+      instead: what Markdown and LaTeX have in its place.
+    """
+
+    kind: ClassVar[str] = "matrix"
+    columns: tuple[str, ...]
+    lines: tuple[tuple[str, tuple[Mark | None, ...]], ...]
+    legend: tuple[tuple[str, str], ...]
+    instead: str
+
+
+Block = Heading | Paragraph | Table | Picture | Link | Matrix
 
 
 def as_markdown(blocks: Sequence[Block]) -> str:
@@ -112,6 +146,8 @@ def _markdown(block: Block) -> str:
             return f"![{caption}]({file})"
         case Link(text, file):
             return f"[{text}]({file})"
+        case Matrix():
+            return block.instead
         case Table() if block.folded:
             return block.instead
     # A bar would end the cell.
@@ -143,6 +179,8 @@ def _latex(block: Block) -> str:
             )
         case Link(text, file):
             return latex_text(f"{text}: {file}")
+        case Matrix():
+            return latex_text(block.instead)
         case Table() if block.folded:
             return latex_text(block.instead)
     # pandas would leave <, > and | as they are.
@@ -165,8 +203,12 @@ def as_html(blocks: Sequence[Block], title: str, pictures: Mapping[str, bytes]) 
     environment.filters["emphasised"] = _emphasised
     images = {name: base64.b64encode(data).decode() for name, data in pictures.items()}
     texts = sorted({block.texts for block in blocks if isinstance(block, Table)})
+    marks = (
+        m for block in blocks if isinstance(block, Matrix) for _, cells in block.lines for m in cells if m is not None
+    )
+    colours = sorted({(mark.kind, mark.colour) for mark in marks})
     template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
-    return template.render(blocks=blocks, title=title, images=images, texts=texts)
+    return template.render(blocks=blocks, title=title, images=images, texts=texts, colours=colours)
 
 
 def _emphasised(text: str) -> markupsafe.Markup:

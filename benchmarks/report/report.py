@@ -138,6 +138,7 @@ class Report:
       curve_columns, curve: rates over a column; empty without that option.
       baseline, differences: paired differences from that variant, its label; None and empty without that option.
       films: pictures of single episodes.
+      drawn: the files of all single episodes that are drawn; see `scene_map.drawn_files`.
     """
 
     episodes: Sequence[Row]
@@ -152,6 +153,7 @@ class Report:
     baseline: str | None
     differences: VariantDifferences
     films: Sequence[Film] = ()
+    drawn: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, rows: Sequence[Row], options: ReportOptions | None = None) -> Report:

@@ -15,6 +15,7 @@ from mechsearch_jax.benchmarks.pages.pages import as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report.report import Failures, Report
 from mechsearch_jax.benchmarks.report.report_figures import curve_figure, rates_figure, success_figure
 from mechsearch_jax.benchmarks.report.report_page import blocks
+from mechsearch_jax.benchmarks.report.scene_map import scene_records
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT, label_variants
@@ -25,7 +26,7 @@ from mechsearch_jax.viz.drawing import save_figure
 # What every report consists of, and what one has with more options; the folder `films.FOLDER` holds pictures.
 FILES = (
     *("report.md", "report.tex", "report.html", "rates.csv", "rates.json", "actions.csv", "failures.csv", "events.csv"),
-    *("key.csv", "success.png", "rates.png"),
+    *("key.csv", "scenes.csv", "success.png", "rates.png"),
 )
 OPTIONAL_FILES = ("curve.csv", "curve.png", "paired.csv")
 DIFFERENCE_COLUMNS = ("method", "goal", "pairs", "scenes", "difference", "standard_error", "gains", "losses")
@@ -102,6 +103,7 @@ def _tables(report: Report) -> dict[str, str]:
         "failures.csv": _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
         "events.csv": _csv(events, _columns(Events, list(report.variants[0].group))),
         "key.csv": _csv(_key_records(report)),
+        "scenes.csv": _csv(scene_records(report.episodes, report.key)),
     }
     if curve:
         files["curve.csv"] = _csv(curve, _columns(Rates, list(report.curve[0].group)))

@@ -13,6 +13,7 @@ from mechsearch_jax.benchmarks.report.report import (
     chosen_scenes_remark,
     failure_reason,
 )
+from mechsearch_jax.benchmarks.report.scene_map import scene_map
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
 from mechsearch_jax.benchmarks.statistics.intervals import Interval
 from mechsearch_jax.benchmarks.statistics.paired import RESTRICTED, STEPS, PairedDifference
@@ -26,6 +27,11 @@ SHARES = {
     "paper_graspable": "with the paper's grasps",
     "retrieved": "retrieved",
 }
+
+
+# Reasons of failure that have a column of their own, and the heading of the column of all others.
+MOST_REASONS = 6
+OTHER = "another reason"
 
 
 def blocks(report: Report) -> list[Block]:
@@ -52,6 +58,7 @@ def blocks(report: Report) -> list[Block]:
         *_curve(report),
         *_differences(report),
         *_reasons(report),
+        *scene_map(report.episodes, report.key, report.drawn),
         Heading("What happened on the way"),
         *_events(report),
         *_actions(report),
@@ -62,9 +69,15 @@ def blocks(report: Report) -> list[Block]:
 def _key(key: Key) -> list[Block]:
     if not key.numbered:
         return []
-    header = ("label", *next(iter(key.options.values())))
-    lines = [(short, *key.options[label].values()) for label, short in key.short.items()]
-    return [Heading("Key"), Table.of(header, lines, texts=len(header))]
+    named = [(short, *key.presets[label]) for label, short in key.short.items() if label in key.presets]
+    others = [(short, *key.options[label].values()) for label, short in key.short.items() if label not in key.presets]
+    parts: list[Block] = [Heading("Key")]
+    if named:
+        parts.append(Table.of(("variant", "preset", "what differs from it"), named, texts=3))
+    if others:
+        header = ("label", *next(iter(key.options.values())))
+        parts.append(Table.of(header, others, texts=len(header)))
+    return parts
 
 
 def _many(report: Report) -> bool:
@@ -165,14 +178,34 @@ def _reasons(report: Report) -> list[Block]:
     if not report.reasons:
         return [heading, Paragraph("None did.")]
     lines = [(report.key.short[f.method], f.reason, f.episodes, f"{f.share:.2f}") for f in report.reasons]
-    by_method = Table.of(("method", "reason", "episodes", "share"), lines, texts=2)
     if len(report.key.short) == 1:
-        return [heading, by_method]
+        return [heading, Table.of(("method", "reason", "episodes", "share"), lines, texts=2)]
     counts = collections.Counter(failure_reason(row) for row in report.episodes if not row.retrieved)
     shares = [(reason, n, f"{n / len(report.episodes):.2f}") for reason, n in counts.most_common()]
-    if _many(report):
-        by_method = dataclasses.replace(by_method, folded="by variant", instead="By variant: see failures.csv.")
-    return [heading, Table.of(("reason", "episodes", "share"), shares), by_method]
+    explanation = Paragraph(
+        "Of each variant the share of its episodes that ended for a reason, the most frequent ones."
+    )
+    return [
+        heading,
+        Table.of(("reason", "episodes", "share"), shares),
+        explanation,
+        _failures_by_variant(report, counts),
+    ]
+
+
+def _failures_by_variant(report: Report, counts: collections.Counter[str]) -> Table:
+    """A line for each variant, a column for each of the most frequent reasons, and one for all others."""
+    reasons = [reason for reason, _ in counts.most_common(MOST_REASONS)]
+    shares: dict[str, dict[str, float]] = {label: {} for label in report.key.short}
+    for failure in report.reasons:
+        column = failure.reason if failure.reason in reasons else OTHER
+        shares[failure.method][column] = shares[failure.method].get(column, 0.0) + failure.share
+    columns = [*reasons, *([OTHER] if len(counts) > len(reasons) else [])]
+    lines = [
+        (short, f"{sum(shares[label].values()):.2f}", *(f"{shares[label].get(column, 0.0):.2f}" for column in columns))
+        for label, short in report.key.short.items()
+    ]
+    return Table.of(("variant", "lost", *columns), lines)
 
 
 def _events(report: Report) -> list[Block]:

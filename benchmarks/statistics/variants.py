@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
+from mechsearch_jax.benchmarks.statistics.preset_names import PresetName, named_once, preset_name
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
 from mechsearch_jax.runtime.errors import InputError, nearest
 
@@ -38,11 +39,16 @@ def _left_out(name: str) -> str:
     return "usual" if "." in name else "unknown"
 
 
-def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
-    """For each row its variant, and for each variant the policy and the options that differ."""
+def _options_of_variants(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, dict[str, Any]]]:
+    """For each row its variant, and for each variant its options."""
     variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
-    each = {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    return variants, {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
+
+
+def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
+    """For each row its variant, and for each variant the policy and the options that differ."""
+    variants, each = _options_of_variants(rows)
     names = sorted({name for options in each.values() for name in options} - {"policy"})
     differing = [name for name in names if len({json.dumps(options.get(name)) for options in each.values()}) > 1]
     parts = {
@@ -83,16 +89,24 @@ class Key:
       short: by the labels of `label_variants`, in an order in which numbers count as such.
       common: the policy, where it is the same in all of several variants and left out of the short labels; else empty.
       options: what each variant's options are that differ, by its label, and then by the option's name in words.
+      presets: the names that say by which preset a variant is called, by its label; empty where the policy and the
+        options that differ say enough.
     """
 
     short: Mapping[str, str]
     common: str = ""
     options: Mapping[str, Mapping[str, str]] = dataclasses.field(default_factory=dict)
+    presets: Mapping[str, PresetName] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Key:
-        """The key of rows: labels without a policy that all have, or numbers where these are too long."""
-        parts = {_label(*part): part for part in _differing(rows)[1].values()}
+        """The key of rows: labels without a policy that all have.
+
+        Where one is too long, names by preset and what deviates from it; numbers where these are too long, too, or say
+        not enough.
+        """
+        of_variants = _differing(rows)[1]
+        parts = {_label(*part): part for part in of_variants.values()}
         labels = sorted(parts, key=natural)
         policies = {policy for policy, _ in parts.values()}
         common = policies.pop() if len(policies) == 1 and len(labels) > 1 else ""
@@ -101,7 +115,11 @@ class Key:
         if max(map(len, plain.values()), default=0) <= LONGEST:
             return cls(plain, common, options)
         digits = len(str(len(labels)))
-        return cls({label: f"V{i:0{digits}d}" for i, label in enumerate(labels, start=1)}, common, options)
+        numbers = {label: f"V{i:0{digits}d}" for i, label in enumerate(labels, start=1)}
+        each = _options_of_variants(rows)[1]
+        names = {_label(*of_variants[variant]): preset_name(each[variant], _text) for variant in each}
+        presets = named_once(names)
+        return cls({label: str(presets.get(label, numbers[label])) for label in labels}, common, options, presets)
 
     @property
     def numbered(self) -> bool:
@@ -122,9 +140,11 @@ class Key:
         """
         if text in self.short:
             return text
+        if exact := [label for label, short in self.short.items() if text == short]:
+            return exact[0]
         parts = {part.strip().replace("=", " ").replace("_", " ") for part in text.split(",")}
         matches = [
-            label for label, short in self.short.items() if text == short or parts <= set(label.split(", ")) | {short}
+            label for label, short in self.short.items() if parts <= {*label.split(", "), *short.split(", "), short}
         ]
         if len(matches) == 1:
             return matches[0]

@@ -60,6 +60,7 @@ def report(
 
     from mechsearch_jax.benchmarks.report import films as single
     from mechsearch_jax.benchmarks.report.report import Report, ReportOptions, changed_scenarios_remark, read_tables
+    from mechsearch_jax.benchmarks.report.scene_map import drawn_files
     from mechsearch_jax.benchmarks.statistics.paired import PAIRED
 
     if films and out is None:
@@ -75,7 +76,8 @@ def report(
 
         with Console(stderr=True).status("writing") as status:
             draw = _drawer(scenes, status.update) if films else None
-            results_report = dataclasses.replace(results_report, films=single.films(episodes, out, draw))
+            shown = single.films(episodes, out, draw)
+            results_report = dataclasses.replace(results_report, films=shown, drawn=drawn_files(out))
             write_report(results_report, out, lambda file: status.update(f"writing {file}"))
     _print(console, results_report, bool(rows))
     if remark := changed_scenarios_remark(episodes):

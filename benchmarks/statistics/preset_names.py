@@ -1,0 +1,91 @@
+"""Names of variants: the nearest preset and what deviates from it, as "standard, masks" or "paper, gamma 0.5"."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mechsearch_jax.planner import PRESETS
+
+# Options beside those of presets, with their usual values; and those whose values say what they are of.
+USUAL: Mapping[str, Any] = {
+    "policy": "search-for-grasp",
+    "recognition": "oracle",
+    "protocol": "strict",
+    "target": "cylinder",
+}
+PLAIN = ("policy", "recognition", "target")
+# A name that is longer fits into no table.
+LONGEST_NAME = 40
+
+
+class PresetName(NamedTuple):
+    """What a variant is called.
+
+    Attributes:
+      preset: the one with the fewest options that deviate.
+      deviations: these options in words, a comma between each.
+    """
+
+    preset: str
+    deviations: str
+
+    def __str__(self) -> str:
+        return f"{self.preset}, {self.deviations}" if self.deviations else self.preset
+
+
+def preset_name(options: Mapping[str, Any], text: Any) -> PresetName | None:
+    """The name of a variant.
+
+    Args:
+      options: of the variant, by name.
+      text: writes the value of an option.
+
+    Returns:
+      The name; None if the options do not tell one preset from another.
+    """
+    presets = _presets()
+    if any(name not in options for name in _telling()):
+        return None
+    deviating = {preset: _deviating(options, values) for preset, values in presets.items()}
+    # The first of several that are as near.
+    preset = min(deviating, key=lambda name: len(deviating[name]))
+    return PresetName(preset, ", ".join(_words(name, text(options[name])) for name in deviating[preset]))
+
+
+def named_once(names: Mapping[str, PresetName | None]) -> dict[str, PresetName]:
+    """Those names that are short enough and stand for one variant alone, by variant."""
+    every = [str(name) for name in names.values() if name is not None]
+    return {
+        variant: name
+        for variant, name in names.items()
+        if name is not None and len(str(name)) <= LONGEST_NAME and every.count(str(name)) == 1
+    }
+
+
+@functools.cache
+def _presets() -> dict[str, dict[str, Any]]:
+    """The options of each preset."""
+    return {name: {**preset().options(), **USUAL} for name, preset in PRESETS.items()}
+
+
+@functools.cache
+def _telling() -> frozenset[str]:
+    """The options in which presets differ."""
+    values = list(_presets().values())
+    return frozenset(name for name in values[0] if len({json.dumps(each[name]) for each in values}) > 1)
+
+
+def _deviating(options: Mapping[str, Any], preset: Mapping[str, Any]) -> list[str]:
+    """The options that deviate from a preset; of those outside of it, the paths of settings that are not usual."""
+    known = [name for name in preset if name in options and json.dumps(options[name]) != json.dumps(preset[name])]
+    return known + sorted(name for name in options if name not in preset and "." in name)
+
+
+def _words(name: str, value: str) -> str:
+    """An option in words."""
+    if name in PLAIN:
+        return value
+    return f"{name.rpartition('.')[2].replace('_', ' ')} {value}"
