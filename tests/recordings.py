@@ -1,4 +1,6 @@
-"""A short recorded episode for tests: a push, a step in which nothing is done, and a retrieval."""
+"""Short recorded episodes for tests: a push, a step in which nothing is done, and a retrieval; and a lost one."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -6,11 +8,15 @@ import numpy as np
 from stage import HIDDEN
 
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
+from mechsearch_jax.envs.episode.records import Episode, Step, record_action
+from mechsearch_jax.envs.recording.evidence import Evidence, Forecasts
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording, empty_trace
 from mechsearch_jax.envs.recording.sampled import sampled
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, from_scenario, true_superquadrics
+from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
 from mechsearch_jax.planner.state import Sequences
+from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -97,3 +103,53 @@ RECORDING = Recording(
         step("3  take the target out", **FOUND),
     ),
 )
+
+POSES = len(RECORDING.steps[0].existence)
+SLOTS = OBJECTS.capacity
+
+
+def stacked(*actions):
+    return jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a]), *actions)
+
+
+def evidence(found=False, hits=((0,), (0, 2)), tried=None):
+    """Evidence of a step with two candidates, where each grasp hits what is listed for it."""
+    everywhere, level = np.ones((2, POSES), bool), np.ones((2, POSES), np.int32)
+    table = np.array([[i in row for i in range(SLOTS)] for row in hits])
+    return Evidence(
+        confidence=np.where(np.asarray(OBJECTS.valid), np.float32(0.9), np.float32(0.0)),
+        believed_pose=np.array([0.62, 0.07, 0.0], np.float32) if found else np.full(3, np.nan, np.float32),
+        hits=table,
+        forecasts=Forecasts(np.arange(2), everywhere, level, np.array([1, 2] if found else [-1, -1], np.int32)),
+        tried=tried or nothing_tried(),
+    )
+
+
+TRIED = TriedActions(stacked(FAR, PUSH), np.array([TrialResult.HARMFUL, TrialResult.SUCCEEDED], np.int32))
+STEPS = (
+    dataclasses.replace(RECORDING.steps[0], evidence=evidence(tried=TRIED)),
+    dataclasses.replace(RECORDING.steps[1], evidence=evidence(found=True), found=True),
+)
+
+
+def record(action, **changes):
+    fields = {
+        "belief_size": 99, "found": False, "graspable": False, "cost": 100.0, "predicted_cost": 60.0,
+        "observed_cost": 95.0, "sequences": 2, "failure": None, "timings": {}, "truth_possible": True,
+        "action": None if action is None else record_action(action),
+    }  # fmt: skip
+    return Step(**{**fields, **changes})
+
+
+EPISODE = Episode(
+    scenario="hidden",
+    objects=1,
+    config={"policy": "search-for-grasp", "recognition": "masks", "max_steps": 1, "seed": 3},
+    versions={},
+    steps=(record(PUSH), record(None, found=True, cost=None, predicted_cost=None, observed_cost=None)),
+    found_step=1,
+    graspable_step=None,
+    retrieved=False,
+    failure="found, but not graspable",
+)
+LOST = dataclasses.replace(RECORDING, heading="hidden: found after 1 action", steps=STEPS, episode=EPISODE)

@@ -7,80 +7,46 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recordings import FAR, OBJECTS, PUSH, RECORDING, RETRIEVAL, SEQUENCES, step
+from recordings import (
+    EPISODE,
+    FAR,
+    LOST,
+    OBJECTS,
+    POSES,
+    PUSH,
+    RECORDING,
+    RETRIEVAL,
+    SEQUENCES,
+    SLOTS,
+    STEPS,
+    evidence,
+    record,
+    stacked,
+    step,
+)
 from stage import HIDDEN
 
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.episode.moments import TriedActions, nothing_tried
-from mechsearch_jax.envs.episode.noted_trials import NotedTrials
+from mechsearch_jax.envs.episode.numbering import named_tried
 from mechsearch_jax.envs.episode.protocols import REACHED
-from mechsearch_jax.envs.episode.records import Episode, Step, record_action, save_episode
+from mechsearch_jax.envs.episode.records import record_action, save_episode
 from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets
 from mechsearch_jax.envs.page import page as pages
 from mechsearch_jax.envs.page.ending import ending, executed_words, plain
 from mechsearch_jax.envs.page.page import RECORD, page, recording_with_record
 from mechsearch_jax.envs.page.pictures import hidden_behind, last_world
 from mechsearch_jax.envs.page.steps import candidates, shapes
-from mechsearch_jax.envs.recording.evidence import Evidence, Forecasts, foreseen_rows
+from mechsearch_jax.envs.recording.evidence import Forecasts, foreseen_rows
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
 from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision, initial_belief
+from mechsearch_jax.planner.noted_trials import NotedTrials, TriedActions
 from mechsearch_jax.planner.trials import TrialResult, decide, sequences_to_try
 from mechsearch_jax.runtime.errors import InputError
-
-POSES = len(RECORDING.steps[0].existence)
-SLOTS = OBJECTS.capacity
-
-
-def stacked(*actions):
-    return jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a]), *actions)
-
-
-def evidence(found=False, hits=((0,), (0, 2)), tried=None):
-    """Evidence of a step with two candidates, where each grasp hits what is listed for it."""
-    everywhere, level = np.ones((2, POSES), bool), np.ones((2, POSES), np.int32)
-    table = np.array([[i in row for i in range(SLOTS)] for row in hits])
-    return Evidence(
-        confidence=np.where(np.asarray(OBJECTS.valid), np.float32(0.9), np.float32(0.0)),
-        believed_pose=np.array([0.62, 0.07, 0.0], np.float32) if found else np.full(3, np.nan, np.float32),
-        hits=table,
-        forecasts=Forecasts(np.arange(2), everywhere, level, np.array([1, 2] if found else [-1, -1], np.int32)),
-        tried=tried or nothing_tried(),
-    )
-
-
-TRIED = TriedActions(stacked(FAR, PUSH), np.array([TrialResult.HARMFUL, TrialResult.SUCCEEDED], np.int32))
-STEPS = (
-    dataclasses.replace(RECORDING.steps[0], evidence=evidence(tried=TRIED)),
-    dataclasses.replace(RECORDING.steps[1], evidence=evidence(found=True), found=True),
-)
-
-
-def record(action, **changes):
-    fields = {
-        "belief_size": 99, "found": False, "graspable": False, "cost": 100.0, "predicted_cost": 60.0,
-        "observed_cost": 95.0, "sequences": 2, "failure": None, "timings": {}, "truth_possible": True,
-        "action": None if action is None else record_action(action),
-    }  # fmt: skip
-    return Step(**{**fields, **changes})
-
-
-EPISODE = Episode(
-    scenario="hidden",
-    objects=1,
-    config={"policy": "search-for-grasp", "recognition": "masks", "max_steps": 1, "seed": 3},
-    versions={},
-    steps=(record(PUSH), record(None, found=True, cost=None, predicted_cost=None, observed_cost=None)),
-    found_step=1,
-    graspable_step=None,
-    retrieved=False,
-    failure="found, but not graspable",
-)
-LOST = dataclasses.replace(RECORDING, heading="hidden: found after 1 action", steps=STEPS, episode=EPISODE)
 
 
 @pytest.fixture(scope="module")
@@ -376,7 +342,7 @@ def test_decisions_are_the_same_with_trials_that_are_noted(problem):
         arguments = (jax.random.key(0), problem, initial_belief(problem), observation)
         plainly, noting = (decide(lambda *_: decision, each, *arguments) for each in (trials, noted))
         jax.tree.map(np.testing.assert_array_equal, plainly, noting)
-        assert len(noted.tried(np.arange(SLOTS)).result)
+        assert len(noted.tried().result)
     assert int(plainly.refused) == 0
 
 
@@ -413,15 +379,15 @@ def test_trials_are_noted_up_to_the_first_success_with_the_bodies_numbers():
     push = jax.tree.map(jnp.asarray, PUSH.replace(object=np.int32(1)))
     actions = jax.tree.map(lambda a: jnp.stack([a] * 4)[None], push)
     bodies = np.array([3, 5, *range(6)])[:SLOTS]
-    assert len(noted.tried(bodies).result) == 0
+    assert len(noted.tried().result) == 0
     call = NotedTrials.__call__.__wrapped__
     results = call(noted, None, None, actions, np.array([[True, False, True, True]]))
     np.testing.assert_array_equal(results, [codes])
-    tried = noted.tried(bodies)
+    tried = named_tried(noted.tried(), bodies)
     assert tried.result.tolist() == [TrialResult.HARMFUL, TrialResult.SUCCEEDED]
     assert tried.action.object.tolist() == [5, 5]
     call(noted, None, None, actions, np.array([[True, True, False, False]]))
-    assert len(noted.tried(bodies).result) == 4
+    assert len(noted.tried().result) == 4
     assert tried.action.kind.tolist() == [int(PUSH.kind)] * 2
     assert int(no_action().kind) not in tried.action.kind.tolist()
 
@@ -433,9 +399,19 @@ def test_the_command_writes_the_page(tmp_path, capsys):
     assert "page.html" in capsys.readouterr().out
 
 
+def test_a_film_is_shown_from_where_it_lies(tmp_path):
+    from mechsearch_jax.envs.page.page import save_page
+
+    save_page(LOST, tmp_path / "pages" / "page.html", tmp_path / "films" / "a film.mp4")
+    text = (tmp_path / "pages" / "page.html").read_text(encoding="utf-8")
+    assert '<video controls muted playsinline preload="metadata" src="../films/a%20film.mp4">' in text
+    assert "<video" not in page(LOST)
+    assert '<img src="film.webp" alt="The film' in page(LOST, "film.webp")
+
+
 def test_a_page_that_cannot_be_made_leaves_what_was_there(tmp_path, monkeypatch):
     (tmp_path / "page.html").write_text("before")
-    monkeypatch.setattr(pages, "page", lambda recording: (_ for _ in ()).throw(RuntimeError("drawn wrong")))
+    monkeypatch.setattr(pages, "page", lambda *arguments: (_ for _ in ()).throw(RuntimeError("drawn wrong")))
     with pytest.raises(RuntimeError):
         pages.save_page(LOST, tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text() == "before"
@@ -455,6 +431,12 @@ def test_bad_input_is_refused_in_one_line(tmp_path):
     save_recording(LOST, tmp_path / NAME)
     with pytest.raises(InputError, match="view: --fps 0 is not between"):
         cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "page.html"), "--fps", "0"])()
+    for arguments, message in (
+        (["--film", str(tmp_path / "film.mp4")], "view: --film is shown in a page; give --save, too"),
+        (["--save", str(tmp_path / "page.html"), "--film", str(tmp_path / "film.avi")], "film.avi: ends in none of"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            cli.parse(["view", str(tmp_path), *arguments])()
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(InputError, match="cannot be written"):
         cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "taken" / "page.html")])()

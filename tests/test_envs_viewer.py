@@ -8,16 +8,18 @@ import threading
 import numpy as np
 import pytest
 from browser import page, wait_for
-from recordings import MOVES, OBJECTS, RECORDING, SAMPLED, WORLD
+from recordings import LOST, MOVES, OBJECTS, RECORDING, SAMPLED, WORLD
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.page.ending import Ending, ending
 from mechsearch_jax.envs.recording.recording import NAME, save_recording
+from mechsearch_jax.envs.viewer.shown import card, shown_steps
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import Capsule
-from mechsearch_jax.viz import web
+from mechsearch_jax.viz import drawing, web
 from mechsearch_jax.viz.panda import panda_pieces, panda_solids
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -30,19 +32,22 @@ def free_port():
         return taken.getsockname()[1]
 
 
-@pytest.fixture(scope="module")
-def server():
+def opened():
     viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'mechsearch-jax[viewer]'")
     server = viser.ViserServer("127.0.0.1", free_port(), verbose=False)
     yield server
     server.stop()
 
 
+server = pytest.fixture(scope="module")(opened)
+another_server = pytest.fixture(opened)
+
+
 @pytest.fixture(scope="module")
 def viewer(server):
-    from mechsearch_jax.envs.recording.viewer import Viewer
+    from mechsearch_jax.envs.viewer.viewer import Viewer
 
-    return Viewer(RECORDING, server, FPS)
+    return Viewer.of(RECORDING, server, FPS)
 
 
 def node(server, name):
@@ -115,6 +120,63 @@ def test_a_sampled_action_shows_what_was_predicted_of_it(viewer, server):
     best, worst = (np.array(node(server, f"/sampled/0/{k}").color, int) for k in (0, 1))
     assert best[1] > worst[1]
     assert worst[0] > best[0]
+
+
+def test_numbers_stand_on_the_objects_and_go_with_them(viewer, server):
+    viewer.show(0)
+    number, box = node(server, "/numbers/0"), node(server, "/true/0")
+    height = 2 * float(WORLD.half_size[0, 2])
+    np.testing.assert_allclose(number.position - box.position, [0.0, 0.0, height / 2], atol=1e-6)
+    assert (number.text, number.visible, node(server, "/numbers/1").visible) == ("0", True, False)
+    viewer.show(first_row(viewer, 1) - 1)
+    np.testing.assert_allclose(number.position - box.position, [0.0, 0.0, height / 2], atol=1e-6)
+    assert node(server, "/true/0").position[1] > WORLD.position[0, 1] + 0.09
+
+
+def test_the_map_is_shown_from_above_and_lies_open_in_the_window(viewer, server):
+    viewer.show(0)
+    maps = [shown.above for shown in shown_steps(RECORDING)]
+    np.testing.assert_array_equal(viewer.pictures["above"], maps[0])
+    viewer.show(first_row(viewer, 2))
+    np.testing.assert_array_equal(viewer.pictures["above"], maps[2])
+    assert (maps[0] != maps[2]).any()
+    # From where the page begins most of the cells are seen beside the box, which is as high as they are far behind it.
+    camera = server.initial_camera
+    cells = np.asarray(node(server, "/map/0/cells").batched_positions)
+    rays = cells - np.asarray(camera.position)
+    box = np.asarray(WORLD.position[0]), np.asarray(WORLD.half_size[0])
+    near, far = ((box[0] + side * box[1] - camera.position) / rays for side in (-1, 1))
+    enters, leaves = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
+    assert ((enters > leaves) | (enters > 1)).mean() > 0.9
+
+
+def test_a_card_says_why_the_target_was_lost_and_what_blocks_it(another_server):
+    from mechsearch_jax.envs.viewer.viewer import Viewer
+
+    server = another_server
+    lost = Viewer.of(LOST, server, FPS)
+    for sentence in ending(LOST).sentences:
+        assert sentence in lost.ended
+    assert "Lost: found, but not graspable" in lost.ended
+    lost.show(0)
+    assert "J: 100 before, 60 expected, 95 observed" in lost.text
+    assert "runner-up: push object 0 by 20 cm" in lost.evidence
+    assert "harm: something fell off the board" in lost.evidence
+    assert "refused" in lost.evidence
+    assert "90 %" in lost.evidence
+    assert node(server, "/blocked/0/0") is None
+    lost.show(first_row(lost, 1))
+    assert "hits object 0" in lost.text
+    marked = np.asarray(node(server, "/blocked/1/0").vertices)
+    assert (np.ptp(marked, axis=0) > 2 * np.asarray(OBJECTS.size[0])).all()
+    assert node(server, "/blocked/1").visible
+    colour = node(server, "/recognised/1/0").color
+    np.testing.assert_allclose(colour, 255 * drawing.rgb(drawing.ACTION), atol=1)
+
+
+def test_words_are_escaped():
+    evil = "<script>alert(1)</script>"
+    assert evil not in card(Ending(False, evil, [evil], ()), [evil])
 
 
 def test_time_goes_on_while_it_is_played_and_ends(viewer):

@@ -45,7 +45,8 @@ def scene_map(rows: Sequence[Row], key: Key, drawn: frozenset[str] = frozenset()
     used = {mark.kind for mark in marks}
     legend = [(COLOURS[kind], WORDS[kind]) for kind in COLOURS if kind in used]
     several = any(len(each) > 1 for scene in scenes for each in scene.rows.values())
-    counted = "with how many seeds it was retrieved" if several else "the number of actions where it was retrieved"
+    seeds = "with how many of its seeds it was retrieved, or, of one seed, " if several else ""
+    counted = f"{seeds}the number of actions where it was retrieved"
     links = " A cell with a frame opens the page of that episode." if any(mark.file for mark in marks) else ""
     return [
         Heading("Scenes and variants"),

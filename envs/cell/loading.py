@@ -21,6 +21,7 @@ from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.session.searcher import Searcher
+from mechsearch_jax.session.view import View
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 
@@ -34,6 +35,7 @@ def load_searcher(
     seed: int = 0,
     recogniser: Callable[[Problem], Any] = Recogniser,
     trajectories: TrajectoryConfig | None = None,
+    view: View | None = None,
     keep: bool = True,
     **options: Any,
 ) -> Searcher:
@@ -48,7 +50,7 @@ def load_searcher(
       policy: name or import path, as `--policy` of the command line.
       preset: replaces the file's.
       seed: of all random numbers.
-      recogniser, trajectories: as for a `Searcher`.
+      recogniser, trajectories, view: as for a `Searcher`.
       keep: whether this process keeps what it compiles from now on; see `keep_compilations`.
       **options: planner options that override the file's, such as `rehearsal="none"`.
 
@@ -65,6 +67,7 @@ def load_searcher(
         seed=seed,
         recogniser=recogniser,
         trajectories=trajectories,
+        view=view,
     )
 
 
@@ -76,7 +79,7 @@ def searcher_of(
     Args:
       settings: of a configuration file.
       camera, policy: as for `load_searcher`.
-      **arguments: of a `Searcher`: seed, recogniser, trajectories.
+      **arguments: of a `Searcher`: seed, recogniser, trajectories, view.
 
     Raises:
       InputError: as `load_searcher`.

@@ -24,8 +24,8 @@ from mechsearch_jax.envs.episode.episode_log import (
     takes_target,
     target_trouble,
 )
-from mechsearch_jax.envs.episode.moments import Moment, Watcher, nothing_tried
-from mechsearch_jax.envs.episode.numbering import named_decision, named_observation
+from mechsearch_jax.envs.episode.moments import Moment, Watcher
+from mechsearch_jax.envs.episode.numbering import named_decision, named_observation, named_tried
 from mechsearch_jax.envs.episode.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
@@ -34,6 +34,7 @@ from mechsearch_jax.envs.simulators.simulator import Flowing, Simulator
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ActualCell, Mismatch
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.planner import Policy, Problem
+from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.scenario import Scenario
@@ -285,7 +286,7 @@ class EpisodePool:
         log, bodies = self.running[0].log, np.asarray(slot.truth.bodies)
         decision = named_decision(slot.decision, bodies) if 0 in choices and slot.decision is not None else None
         seen = named_observation(slot.observation, bodies)
-        tried = nothing_tried() if slot.noted is None else slot.noted.tried(bodies)
+        tried = nothing_tried() if slot.noted is None else named_tried(slot.noted.tried(), bodies)
         return Moment(log.index, slot.snapshot, seen, slot.belief, decision, log.steps[-1], None, tried)
 
 

@@ -3,35 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-import jax
-import numpy as np
-from jaxtyping import Int
-
-from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode.records import Step
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision
-
-
-class TriedActions(NamedTuple):
-    """The actions that were tried out before one was made, in order, up to the first that succeeded; NumPy arrays.
-
-    Attributes:
-      action: fields with a leading axis K.
-      result: the `TrialResult` of each, shape (K,).
-    """
-
-    action: Action
-    result: Int[np.ndarray, " k"]
-
-
-def nothing_tried() -> TriedActions:
-    """No actions."""
-    return TriedActions(jax.tree.map(lambda a: np.asarray(a)[None][:0], no_action()), np.zeros(0, np.int32))
+from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
 
 
 @dataclasses.dataclass(frozen=True)

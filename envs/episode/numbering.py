@@ -10,6 +10,7 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision
+from mechsearch_jax.planner.noted_trials import TriedActions
 
 # The number of the body that each recognised object stands for.
 Bodies = Int[np.ndarray, " objects"]
@@ -22,6 +23,11 @@ def named_action(action: Action, bodies: Bodies) -> Action:
     index = np.asarray(action.object)
     inside = (index >= 0) & (index < len(bodies))
     return action.replace(object=np.where(inside, bodies[np.where(inside, index, 0)], index).astype(index.dtype))
+
+
+def named_tried(tried: TriedActions, bodies: Bodies) -> TriedActions:
+    """What was tried out, with objects named by bodies' numbers."""
+    return tried._replace(action=named_action(tried.action, bodies))
 
 
 def named_objects(objects: Superquadrics, bodies: Bodies, axis: int = 0) -> Superquadrics:

@@ -21,12 +21,12 @@ from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, Truth, true_target_pose, truth_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen
-from mechsearch_jax.envs.episode.noted_trials import NotedTrials
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge, swept_free
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.learning import restored
+from mechsearch_jax.planner.noted_trials import NotedTrials
 from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.runtime.compiled import kept
 

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from mechsearch_jax.actions import KINDS, Action, kind_of
-from mechsearch_jax.envs.episode.moments import nothing_tried
 from mechsearch_jax.envs.episode.protocols import REACHED
 from mechsearch_jax.envs.episode.records import ActionRecord, Episode
 from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, objects_in_words
 from mechsearch_jax.envs.page.pictures import hidden_behind, target_pixels
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
+from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.workspace.detector import found_pixels
 

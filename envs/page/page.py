@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
+import urllib.parse
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.episode.records import load_episode
@@ -22,6 +23,7 @@ from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recordin
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, is_file, replacing
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.viz.filmstrip import Frame
 
 _TEMPLATE = Path(__file__).with_name("page.html.jinja")
 RECORD = "episode.json"
@@ -54,39 +56,60 @@ def recording_with_record(folder: Path) -> Recording:
     return dataclasses.replace(recording, episode=episode)
 
 
-def save_page(recording: Recording, path: PathLike) -> None:
+def save_page(recording: Recording, path: PathLike, film: PathLike | None = None) -> None:
     """Write the page of an episode.
+
+    Args:
+      recording: of the episode.
+      path: of the file.
+      film: of the same episode, which the page shows from where it lies; none if left out.
 
     Raises:
       InputError: the file cannot be written.
     """
-    text = page(recording)
+    beside = "" if film is None else Path(os.path.relpath(film, Path(path).parent)).as_posix()
+    text = page(recording, beside)
     with replacing(path) as file:
         file.write(text.encode())
 
 
-def page(recording: Recording) -> str:
-    """The page of an episode as HTML."""
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+def page(recording: Recording, film: str = "") -> str:
+    """The page of an episode as HTML.
+
+    Args:
+      recording: of the episode.
+      film: where its film lies, seen from the page; empty without one.
+    """
+    template = environment().get_template(_TEMPLATE.name)
     painter = Painter(recording)
     shown = [_step(recording, i, painter) for i in range(len(recording.steps))]
     return template.render(
+        film=urllib.parse.quote(film),
+        moves=not film.lower().endswith(".webp"),
         title=recording.heading.partition(":")[0] or "an episode",
         stamp=stamp(),
         card=_card(recording, painter),
         steps=shown,
         bands=[(band.colour, band.label) for band in drawing.bands()],
         colours={name: getattr(drawing, name) for name in ("TARGET", "ACTION", "OBJECT")},
-        left_out=_left_out(recording),
+        left_out=left_out(recording),
+    )
+
+
+def environment() -> jinja2.Environment:
+    """The templates of this folder."""
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATE.parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
     )
 
 
 def stamp() -> str:
     """A hash of the program that writes pages, which every page carries: another one, and the page is of other code."""
-    sources = [_TEMPLATE, *sorted(_TEMPLATE.parent.glob("*.py"))]
+    sources = [file for kind in ("*.jinja", "*.py") for file in sorted(_TEMPLATE.parent.glob(kind))]
     return hashlib.sha256("\0".join(source.read_text(encoding="utf-8") for source in sources).encode()).hexdigest()[:16]
 
 
@@ -127,7 +150,7 @@ def _facts(recording: Recording) -> list[tuple[str, str]]:
     return facts
 
 
-def _left_out(recording: Recording) -> list[str]:
+def left_out(recording: Recording) -> list[str]:
     """What the recording does not hold, so that the page leaves it out."""
     sentences = []
     if recording.episode is None:
@@ -141,36 +164,55 @@ def _left_out(recording: Recording) -> list[str]:
 
 
 def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
+    """What the page shows of a step, by the template's names."""
+    step, before = recording.steps[i], recording.steps[i - 1] if i else None
+    frame = recorded_frame(step, recording.camera, recording.shelf)
+    words = step_words(recording, i, frame)
+    pictures = [data_uri(painter.foreseen(step, candidate.row)) for candidate in words["candidates"]]
+    return {
+        **words,
+        "words": action_words(step),
+        "seen": data_uri(painter.seen(frame)),
+        "map": data_uri(painter.believed(step, frame, before, texts.blocked(step))),
+        "candidates": [
+            {**candidate._asdict(), "picture": picture}
+            for candidate, picture in zip(words["candidates"], pictures, strict=True)
+        ],
+        "sampled": len(step.sampled),
+        "retrieves": step.action is not None and kind_of(int(step.action.kind)).takes_target,
+        "recognised": data_uri(painter.recognised(step, frame, texts.confidence(step))) if words["shapes"] else None,
+        **_counts(step),
+    }
+
+
+def step_words(recording: Recording, i: int, frame: Frame) -> dict[str, Any]:
+    """What is said of a step, by the names of the templates.
+
+    Args:
+      recording: of the episode.
+      i: index of the step.
+      frame: its picture.
+    """
     step, before = recording.steps[i], recording.steps[i - 1] if i else None
     record = None if recording.episode is None else recording.episode.steps[i]
-    frame = recorded_frame(step, recording.camera, recording.shelf)
-    candidates = texts.candidates(step)
     shapes = texts.shapes(recording, step, frame.owner)
-    blocked = texts.blocked(step)
-    sure = np.full(step.scene.capacity, np.nan) if step.evidence is None else step.evidence.confidence
+    executed = executed_words(recording, i)
     return {
         "number": i + 1,
         "heading": texts.heading(step),
         "kind": "end" if step.action is None else kind_of(int(step.action.kind)).name,
-        "words": action_words(step),
-        "executed": "" if executed_words(recording, i) == action_words(step) else executed_words(recording, i),
+        "executed": "" if executed == action_words(step) else executed,
         "found": step.found,
-        "blocked": bool(blocked),
+        "blocked": bool(texts.blocked(step)),
         "belief": texts.poses_in_words(step, before),
         "truth": texts.truth(step, record),
         "grasps": texts.grasps_words(step),
-        "seen": data_uri(painter.seen(frame)),
-        "map": data_uri(painter.believed(step, frame, before, blocked)),
-        "candidates": [{**c._asdict(), "picture": data_uri(painter.foreseen(step, c.row))} for c in candidates],
-        "sampled": len(step.sampled),
-        "retrieves": step.action is not None and kind_of(int(step.action.kind)).takes_target,
+        "candidates": texts.candidates(step),
         "trials": texts.trials(step),
         "shapes": shapes,
-        "recognised": data_uri(painter.recognised(step, frame, sure)) if shapes else None,
         "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,
         "costs": texts.costs(recording, i),
         "troubles": texts.troubles(record),
-        **_counts(step),
     }
 
 

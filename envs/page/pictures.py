@@ -60,7 +60,11 @@ class End(NamedTuple):
 
 
 class Painter:
-    """Draws the pictures of one recording at one scale."""
+    """Draws the pictures of one recording at one scale.
+
+    Attributes:
+      room: height of what is shown above the board [m].
+    """
 
     def __init__(self, recording: Recording):
         """Args:
@@ -71,18 +75,18 @@ class Painter:
         self._shelf: Shelf = recording.shelf
         self._target: Target = recording.target
         scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
-        self._room = drawing.height_of(scenes, recording.shelf)
+        self.room = drawing.height_of(scenes, recording.shelf)
 
     def seen(self, frame: Frame) -> Picture:
         """What the camera saw at a step, with the action."""
         camera, shelf = self._camera, self._shelf
-        return self._view(lambda axes: draw_seen(axes, frame, camera, shelf, self._target, self._room))
+        return self._view(lambda axes: draw_seen(axes, frame, camera, shelf, self._target, self.room))
 
     def recognised(self, step: RecordedStep, frame: Frame, confidence: Float[np.ndarray, " n"]) -> Picture:
         """The outlines of the recognised shapes over what the camera saw, coloured by how sure recognition is."""
 
         def draw(axes: Axes) -> None:
-            drawing.draw_view(axes, frame.image, self._camera, self._shelf, self._room)
+            drawing.draw_view(axes, frame.image, self._camera, self._shelf, self.room)
             for i, outline in enumerate(drawing.outlines_in_view(step.scene, self._camera)):
                 if outline is None:
                     continue
@@ -149,7 +153,7 @@ class Painter:
         moment = Moment("", colour_image(image), owner, scene, somewhere, blockers)
 
         def seen(axes: Axes) -> None:
-            draw_seen_blockers(axes, moment, self._camera, self._shelf, self._room)
+            draw_seen_blockers(axes, moment, self._camera, self._shelf, self.room)
             if pose is not None:
                 drawing.draw_hidden_target_in_view(axes, pose, self._target, self._camera, self._shelf)
 
@@ -186,7 +190,7 @@ class Painter:
             axes.scatter(y, x, s=11, c=colour, marker=mark, linewidths=1.0, zorder=2)
 
     def _view(self, draw: Callable[[Axes], None]) -> Picture:
-        left, right, top, bottom = drawing.view_window(self._camera, self._shelf, self._room)
+        left, right, top, bottom = drawing.view_window(self._camera, self._shelf, self.room)
         return _drawn((bottom - top) / (right - left), draw)
 
     def _above(self, draw: Callable[[Axes], None]) -> Picture:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot
@@ -28,6 +28,8 @@ RESULTS = {
     TrialResult.HARMFUL: ("bad", "harm: something fell off the board, or the found target fell over"),
     TrialResult.UNKNOWN: ("poor", "no result: it could not be simulated"),
 }
+# What stands for what nobody knows.
+UNKNOWN = "–"
 # Recognisers that see images, and may be wrong.
 SEEING = ("masks", "full")
 # An object that shows no more pixels than this counts as hidden.
@@ -111,7 +113,8 @@ def grasps_words(step: RecordedStep) -> str:
 def candidates(step: RecordedStep) -> list[Candidate]:
     """The chosen action, the runner-up, and the best action that moves another object if the runner-up does not.
 
-    None where nothing was chosen, or no sequences were compared.
+    The last is left out of recordings that do not foresee it. None where nothing was chosen, or no sequences were
+    compared.
     """
     if step.action is None or not kind_of(int(step.action.kind)).moves_object:
         return []
@@ -120,7 +123,8 @@ def candidates(step: RecordedStep) -> list[Candidate]:
     others = [k for k in every if k not in chosen][:1]
     moved = step.sampled.action.object
     elsewhere = [k for k in every if moved[k] != step.action.object][:1]
-    roles = {"chosen": chosen, "runner-up": others, "best of another object": [k for k in elsewhere if k not in others]}
+    further = [k for k in elsewhere if k not in others and _forecast(step, k)]
+    roles = {"chosen": chosen, "runner-up": others, "best of another object": further}
     return [_candidate(step, role, k) for role, rows in roles.items() for k in rows]
 
 
@@ -211,21 +215,34 @@ def shapes(recording: Recording, step: RecordedStep, owner: Int[np.ndarray, "h w
     if episode is None or episode.config.get("recognition") not in SEEING:
         return []
     truth = objects_of(step.world, recording.camera, recording.shelf)
-    sure = np.full(step.scene.capacity, np.nan) if step.evidence is None else step.evidence.confidence
     rows = []
     for i in range(step.scene.capacity):
         seen, there = bool(step.scene.valid[i]), bool(truth.valid[i])
         if not (seen or there):
             continue
-        confidence = f"{100 * float(sure[i]):.0f} %" if seen and np.isfinite(sure[i]) else "–"
         if not seen:
             visible = bool(np.count_nonzero(owner == i) > FEWEST_PIXELS)
-            rows.append(Shape(str(i), "not recognised" if visible else "hidden", confidence, "–", visible))
+            rows.append(Shape(str(i), "not recognised" if visible else "hidden", UNKNOWN, UNKNOWN, visible))
             continue
         off = float(np.linalg.norm(np.asarray(step.scene.position[i]) - np.asarray(truth.position[i])))
         apart = f"{100 * off:.1f} cm" if there else "nothing is there"
-        rows.append(Shape(str(i), _shape(step, i), confidence, apart, not there or off > WRONG))
+        rows.append(_recognised(step, i)._replace(off=apart, wrong=not there or off > WRONG))
     return rows
+
+
+def recognised(step: RecordedStep) -> list[Shape]:
+    """The recognised objects of a step whose true ones nobody knows."""
+    return [_recognised(step, i) for i in range(step.scene.capacity) if step.scene.valid[i]]
+
+
+def _recognised(step: RecordedStep, i: int) -> Shape:
+    sure = float(confidence(step)[i])
+    return Shape(str(i), _shape(step, i), f"{100 * sure:.0f} %" if np.isfinite(sure) else UNKNOWN, UNKNOWN, False)
+
+
+def confidence(step: RecordedStep) -> Float[np.ndarray, " n"]:
+    """How sure each recognised object is; NaN where nothing says so."""
+    return np.full(step.scene.capacity, np.nan) if step.evidence is None else step.evidence.confidence
 
 
 def _shape(step: RecordedStep, i: int) -> str:

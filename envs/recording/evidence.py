@@ -16,12 +16,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of, no_action
 from mechsearch_jax.envs.camera.snapshot import objects_on_the_board, true_target_pose
-from mechsearch_jax.envs.episode.moments import Moment, TriedActions, nothing_tried
+from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.recording.sampled import Sampled, sampled
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import INFEASIBLE
-from mechsearch_jax.planner import Problem, graspability_map, initial_belief, update_belief
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Decision, Problem, graspability_map, initial_belief, update_belief
+from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.retrieval import TargetGrasps, found_grasps, found_hits
 from mechsearch_jax.runtime.compiled import kept
@@ -89,16 +91,14 @@ def grasps_at(
 def evidence(moment: Moment, problem: Problem) -> Evidence:
     """What lies behind the decision of a moment."""
     seen, belief = moment.observation, moment.belief
-    missing = np.full(seen.objects.capacity, np.nan, np.float32)
     there = objects_on_the_board(moment.snapshot)
     feasible, hits = jax.device_get(grasps_at(problem.target_grasps, there, true_target_pose(moment.snapshot.world)))
-    nowhere = np.full(3, np.nan, np.float32)
     return Evidence(
-        confidence=missing if seen.confidence is None else np.asarray(seen.confidence, np.float32),
-        believed_pose=np.asarray(belief.found_pose, np.float32) if bool(belief.found) else nowhere,
-        hits=hits[feasible],
-        forecasts=_forecasts(moment, problem),
-        tried=moment.tried,
+        confidence_of(seen),
+        believed_pose(belief),
+        hits[feasible],
+        forecasts(problem, belief, seen, moment.decision),
+        moment.tried,
     )
 
 
@@ -111,15 +111,45 @@ def programs(problem: Problem) -> list[Program]:
     ]
 
 
-def _forecasts(moment: Moment, problem: Problem) -> Forecasts:
-    decision = moment.decision
+def evidence_without_truth(
+    problem: Problem, belief: Belief, observation: Observation, decision: Decision | None, tried: TriedActions
+) -> Evidence:
+    """What lies behind a decision where nobody knows the truth: grasps are those of the target where it is believed.
+
+    Args:
+      problem, belief, observation: of the decision.
+      decision: of a policy; None where nothing was decided.
+      tried: what trials came to.
+    """
+    hits = np.zeros((0, observation.objects.capacity), bool)
+    if bool(belief.found):
+        feasible, every = jax.device_get(grasps_at(problem.target_grasps, observation.objects, belief.found_pose))
+        hits = every[feasible]
+    foreseen = forecasts(problem, belief, observation, decision)
+    return Evidence(confidence_of(observation), believed_pose(belief), hits, foreseen, tried)
+
+
+def confidence_of(observation: Observation) -> Float[np.ndarray, " n"]:
+    """How sure each recognised object is; NaN where nothing says so."""
+    if observation.confidence is None:
+        return np.full(observation.objects.capacity, np.nan, np.float32)
+    return np.asarray(observation.confidence, np.float32)
+
+
+def believed_pose(belief: Belief) -> Float[np.ndarray, " 3"]:
+    """x, y [m] and yaw [rad] of the target as the robot believes it; NaN if it has not found it."""
+    return np.asarray(belief.found_pose, np.float32) if bool(belief.found) else np.full(3, np.nan, np.float32)
+
+
+def forecasts(problem: Problem, belief: Belief, observation: Observation, decision: Decision | None) -> Forecasts:
+    """f and g as predicted after the best candidates of a decision; see `foreseen_rows`."""
     candidates = None if decision is None else sampled(decision.sequences)
     if candidates is None or not len(candidates) or not len(candidates.position):
         return nothing_foreseen(len(problem.poses))
-    objects = jax.tree.map(np.asarray, moment.observation.objects)
+    objects = jax.tree.map(np.asarray, observation.objects)
     rows = foreseen_rows(candidates)
-    forecasts = [_forecast(moment, problem, candidates.after(k, objects)) for k in rows]
-    exists, g, least = zip(*forecasts, strict=True)
+    foreseen = [_forecast(problem, belief, observation, candidates.after(k, objects)) for k in rows]
+    exists, g, least = zip(*foreseen, strict=True)
     return Forecasts(np.array(rows), np.stack(exists), np.stack(g), np.array(least, np.int32))
 
 
@@ -135,9 +165,10 @@ def of_another_object(candidates: Sampled) -> int | None:
     return int(others[0]) if len(others) else None
 
 
-def _forecast(moment: Moment, problem: Problem, after: Superquadrics) -> tuple[np.ndarray, np.ndarray, int]:
+def _forecast(
+    problem: Problem, belief: Belief, seen: Observation, after: Superquadrics
+) -> tuple[np.ndarray, np.ndarray, int]:
     """f, g, and the least number of objects in the way of a found target, once the objects are as predicted."""
-    belief, seen = moment.belief, moment.observation
     after = jax.tree.map(jnp.asarray, after)
     g = np.asarray(graspability_map(problem, belief, after), np.int32)
     if bool(belief.found):

@@ -9,10 +9,10 @@ from jaxtyping import Float, UInt8
 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing, sketches, web
+from mechsearch_jax.viz.filmstrip import Frame
 
 # Colours of the best and of the worst sampled action.
 BEST, WORST = drawing.GRASPABLE, drawing.BLOCKED[-1]
@@ -36,42 +36,36 @@ class ShownSample(NamedTuple):
 
 
 class ShownDecision(NamedTuple):
-    """What is shown of a step.
+    """What is shown of a decision.
 
     Attributes:
-      text: the action and its reason.
       view: the camera's image.
       cells: f and g.
-      recognised: the recognised shapes.
       ghosts: the predicted effect of the action, and the hand.
       path: of the action [m]; None if nothing moves.
       samples: the candidates of the decision, best first.
     """
 
-    text: str
     view: UInt8[np.ndarray, "h w 3"]
     cells: web.Cells
-    recognised: list[Ghost]
     ghosts: list[Ghost]
     path: Float[np.ndarray, "points 3"] | None
     samples: list[ShownSample]
 
 
-def shown_decisions(recording: Recording) -> list[ShownDecision]:
-    """What is shown of each step; the camera's images are ray-cast again."""
-    scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
-    room = drawing.height_of(scenes, recording.shelf)
-    return [_decision(step, recording, room) for step in recording.steps]
+def shown_decision(step: RecordedStep, frame: Frame, recording: Recording, room: float) -> ShownDecision:
+    """What is shown of the decision of a step.
 
-
-def _decision(step: RecordedStep, recording: Recording, room: float) -> ShownDecision:
+    Args:
+      step: of the recording.
+      frame: its picture.
+      recording: of the episode.
+      room: see `drawing.height_of`.
+    """
     camera, shelf, target = recording.camera, recording.shelf, recording.target
-    frame = recorded_frame(step, camera, shelf)
     return ShownDecision(
-        text=f"**{step.title}**\n\n{step.caption}",
         view=web.seen_picture(frame, camera, shelf, target, room),
         cells=web.map_cells(frame, shelf, target),
-        recognised=[(str(i), m, drawing.OBJECT, 0.45) for i, m in _present(web.meshes_of(step.scene))],
         ghosts=predicted(step.scene, step.after, frame.sketch),
         path=sketches.shown_path(frame.sketch, shelf),
         samples=_samples(step),

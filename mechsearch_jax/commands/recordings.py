@@ -59,6 +59,7 @@ def view(
     /,
     *,
     save: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html", help_behavior_hint="")] = None,
+    film: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4|FILE.webp", help_behavior_hint="")] = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     fps: int = FPS,
@@ -68,7 +69,8 @@ def view(
 
     Args:
       episode: folder of `search --record` or `search --video`.
-      save: instead write a page that explains every decision, one file that needs no server; the others do not matter.
+      save: instead write a page that explains every decision, one file that needs no server.
+      film: make the film, too, and show it in the page of --save; it stays a file of its own beside the page.
       host: address that is listened at; 0.0.0.0 is every one of this machine, for browsers on others.
       port: of the page; the next free one where it is taken.
       fps: moments in a second.
@@ -81,19 +83,23 @@ def view(
     check_option("view", "port", port, 1, 65535)
     check_pace("view", fps, speed)
     if save is not None:
-        return _save_page(episode, save)
+        return _save_page(episode, save, film, fps, speed)
+    if film is not None:
+        raise InputError("view: --film is shown in a page; give --save, too, or make it alone by mechsearch video")
     viser = import_viser()
-    recording = recording_of(episode)
-    from mechsearch_jax.envs.recording.viewer import Viewer
+    check_recorded(episode)
+    from mechsearch_jax.envs.page.page import recording_with_record
+    from mechsearch_jax.envs.viewer.viewer import Viewer
     from mechsearch_jax.problem.cache import keep_compilations
 
+    recording = recording_with_record(episode)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing"):
         # It would tell its address before there is anything to be seen.
         with contextlib.redirect_stdout(io.StringIO()):
             server = viser.ViserServer(host, port, label=recording.heading, verbose=False)
-        viewer = Viewer(recording, server, fps, speed)
+        viewer = Viewer.of(recording, server, fps, speed)
     shown = "localhost" if host in ("127.0.0.1", "0.0.0.0") else host
     console.print(f"http://{shown}:{server.get_port()}  (Ctrl-C ends it)", soft_wrap=True)
     try:
@@ -103,20 +109,27 @@ def view(
         server.stop()
 
 
-def _save_page(episode: Path, path: Path) -> None:
-    """Write the page of an episode's folder."""
+def _save_page(episode: Path, path: Path, film: Path | None, fps: int, speed: float) -> None:
+    """Write the page of an episode's folder, and its film if one is named."""
     from rich.console import Console
 
     from mechsearch_jax.envs.page.page import check_page_path, recording_with_record
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
+    from mechsearch_jax.viz.movie import check_movie_path
 
     check_page_path(path)
+    if film is not None:
+        check_movie_path(film)
+        check_writable(film.parent)
     check_recorded(episode)
     recording = recording_with_record(episode)
     check_writable(path.parent)
     keep_compilations()
-    make_page(recording, path, Console(highlight=False))
+    console = Console(highlight=False)
+    if film is not None:
+        make_film(recording, film, console, fps=fps, speed=speed)
+    make_page(recording, path, console, film)
 
 
 def check_option(command: str, name: str, value: float | int, least: float | int, most: float | int) -> None:
@@ -182,8 +195,8 @@ def make_film(
     console.print(str(path), soft_wrap=True)
 
 
-def make_page(recording: Recording, path: Path, console: Console) -> None:
-    """Write the page that explains an episode.
+def make_page(recording: Recording, path: Path, console: Console, film: Path | None = None) -> None:
+    """Write the page that explains an episode, which shows a film of it if there is one.
 
     Raises:
       InputError: it cannot be written.
@@ -191,5 +204,5 @@ def make_page(recording: Recording, path: Path, console: Console) -> None:
     from mechsearch_jax.envs.page.page import save_page
 
     with console.status("drawing"):
-        save_page(recording, path)
+        save_page(recording, path, film)
     console.print(str(path), soft_wrap=True)

@@ -94,7 +94,7 @@ class Kept:
         if self.video is not None:
             make_film(recording, self.video, console)
         if self.page is not None:
-            make_page(recording, self.page, console)
+            make_page(recording, self.page, console, self.video)
 
 
 def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrator: Narrator) -> None:

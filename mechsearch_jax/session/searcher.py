@@ -34,6 +34,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.plausibility import EMPTY_SHELF
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.learning import LearnedFriction, restored
+from mechsearch_jax.planner.noted_trials import NotedTrials, nothing_tried
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
@@ -50,6 +51,7 @@ from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.slots import UNTRIED, filled, tries_nothing
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import Motion, Present, SearchStep, display_image, motion_of
+from mechsearch_jax.session.view import View
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.sight import check_camera
 
@@ -93,6 +95,7 @@ class Searcher:
         rehearsal: Trials | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
         trajectories: TrajectoryConfig | None = None,
+        view: View | None = None,
     ):
         """Set up a search. Nothing is compiled yet; see `warm_up`.
 
@@ -111,6 +114,8 @@ class Searcher:
           recogniser: makes a recogniser of a problem; it is called like `Recogniser`.
           trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
             move; the default if left out.
+          view: shows every step and what came of it, such as `envs.viewer.live.LiveView()`; nothing is shown if left
+            out.
 
         Raises:
           InputError: the target cannot be grasped by the gripper, the camera does not see the shelf, a policy is given
@@ -127,6 +132,7 @@ class Searcher:
         self._policy, self._trials = filled(policy, self.config, rehearsal, slots), rehearsal
         self._make_recogniser = recogniser
         self._trajectories = trajectories
+        self._view, self._shown = view, None
         self._state: State | None = None
 
     @functools.cached_property
@@ -229,7 +235,7 @@ class Searcher:
         """A copy of this searcher at the beginning of its search, for which no recognition is too doubtful to move."""
         _ = self._view_warnings
         twin = copy.copy(self)
-        twin._state = beginning(self.problem)
+        twin._state, twin._view = beginning(self.problem), None
         twin._trajectories = dataclasses.replace(self._trajectories or TrajectoryConfig(), doubt=warming.TRUSTING)
         return twin
 
@@ -280,7 +286,7 @@ class Searcher:
         warnings += faults.belief_warnings(now.belief, belief, shelf_is_empty=shelf_is_empty)
         learned = self._learned(observation)
         trials = self._trials if learned is None else learned.trials([0])
-        decision, motion = self._decide(decision_key, trials, belief, observation, images.depth, present)
+        decision, motion, noted = self._decide(decision_key, trials, belief, observation, images.depth, present)
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -296,6 +302,9 @@ class Searcher:
             image=display_image(images.depth, images.colour),
         )
         self._keep(step, learned)
+        if self._view is not None:
+            self._view.decided(step, nothing_tried() if noted is None else noted.tried())
+            self._shown = step
         return step
 
     def _seen(self, key: Array, images: Images) -> tuple[Observation, list[str], bool]:
@@ -357,19 +366,20 @@ class Searcher:
         observation: Observation,
         depth: np.ndarray,
         present: Present,
-    ) -> tuple[Decision, Motion]:
-        """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it.
+    ) -> tuple[Decision, Motion, NotedTrials | None]:
+        """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it, and its trials if shown.
 
         A retrieval is drawn only once, for its grasp does not depend on the key.
         """
-        problem, arm = self.problem, self.workcell.arm
+        problem, arm, noted = self.problem, self.workcell.arm, None
         for draw in range(DRAWS):
             draw_key = jax.random.fold_in(key, draw) if draw else key
-            decision = decide(self._policy, trials, draw_key, problem, belief, observation)
+            noted = NotedTrials(trials) if trials is not None and self._view is not None else None
+            decision = decide(self._policy, noted or trials, draw_key, problem, belief, observation)
             motion = motion_of(problem, belief, observation, decision, depth, present, arm, self._motions)
             if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
-        return decision, self._within_limit(motion)
+        return decision, self._within_limit(motion), noted
 
     @property
     def _motions(self) -> TrajectoryConfig:
@@ -409,6 +419,8 @@ class Searcher:
         took = ok and kind_of(int(now.action.kind)).takes_target
         over = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, executed=ok)
         self._state = dataclasses.replace(over, finished=took, refusals=0)
+        if self._view is not None and self._shown is not None:
+            self._view.acted(self._shown, ok)
 
     def save(self, path: PathLike) -> None:
         """Save the search's state as an archive of arrays, .npz, so that `load` can continue it after a crash.

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from mechsearch_jax.actions import Action
-from mechsearch_jax.envs.episode.moments import TriedActions, nothing_tried
-from mechsearch_jax.envs.episode.numbering import Bodies, named_action
-from mechsearch_jax.planner import Problem
+from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.planner.trials import TrialResult, Trials, TrialScenes
+from mechsearch_jax.problem.problem import Problem
+
+
+class TriedActions(NamedTuple):
+    """The actions that were tried out before one was made, in order, up to the first that succeeded; NumPy arrays.
+
+    Attributes:
+      action: fields with a leading axis K.
+      result: the `TrialResult` of each, shape (K,).
+    """
+
+    action: Action
+    result: Int[np.ndarray, " k"]
+
+
+def nothing_tried() -> TriedActions:
+    """No actions."""
+    return TriedActions(jax.tree.map(lambda a: np.asarray(a)[None][:0], no_action()), np.zeros(0, np.int32))
 
 
 class NotedTrials:
@@ -31,16 +48,15 @@ class NotedTrials:
         self._calls.append((actions, np.asarray(wanted)[0], results[0]))
         return results
 
-    def tried(self, bodies: Bodies) -> TriedActions:
-        """The actions that were tried, their objects by bodies' numbers, and the results.
+    def tried(self) -> TriedActions:
+        """The actions that were tried, and the results.
 
         Those after the first success of a call are left out: nothing depends on them.
         """
         parts = [_until_success(*call) for call in self._calls]
         if not parts:
             return nothing_tried()
-        action, result = jax.tree.map(lambda *a: np.concatenate(a), *parts)
-        return TriedActions(named_action(action, bodies), result)
+        return TriedActions(*jax.tree.map(lambda *a: np.concatenate(a), *parts))
 
 
 def _until_success(actions: Action, wanted: np.ndarray, results: np.ndarray) -> TriedActions:

@@ -1,0 +1,136 @@
+"""What the viewer shows of each step of a recording: pictures, meshes and words, the latter those of the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from mechsearch_jax.envs.page import steps as texts
+from mechsearch_jax.envs.page.ending import Ending
+from mechsearch_jax.envs.page.page import environment, step_words
+from mechsearch_jax.envs.page.pictures import Painter, Picture, colour_of
+from mechsearch_jax.envs.recording.pictures import recorded_frame
+from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
+from mechsearch_jax.envs.recording.shown_decisions import Ghost, ShownDecision, shown_decision
+from mechsearch_jax.viz import drawing, web
+from mechsearch_jax.viz.blockers import MARK
+from mechsearch_jax.viz.filmstrip import Frame
+
+# How far the mark of an object in the way stands off its surface [m].
+OFF = 0.004
+# Colours of the panel's words.
+COLOURS = {"good": drawing.GRASPABLE, "poor": "#9a5b12", "bad": drawing.TARGET, "idle": drawing.WALL}
+_TEMPLATE = Path(__file__).with_name("panel.html.jinja")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShownStep:
+    """What is shown of a step.
+
+    Attributes:
+      words: by the names of the templates; see `page.step_words`.
+      recorded: the step.
+      decision: meshes, and what the camera saw.
+      above: the shelf from above with f and g.
+      perceived: the outlines of the recognised shapes by how sure they are; None where the true shapes were given.
+      recognised: the recognised shapes.
+      blocked: the marks of the objects that the best grasps of a found target hit.
+    """
+
+    words: Mapping[str, Any]
+    recorded: RecordedStep
+    decision: ShownDecision
+    above: Picture
+    perceived: Picture | None
+    recognised: list[Ghost]
+    blocked: list[Ghost]
+
+    @property
+    def title(self) -> str:
+        """The step's number and what is done."""
+        return f"{self.words['number']}. {self.words['heading']}"
+
+    def text(self, examined: str = "") -> str:
+        """What was believed and decided, as HTML; `examined` is the candidate whose prediction is shown."""
+        return str(_panel().step({**self.words, "examined": examined}))
+
+    @property
+    def evidence(self) -> str:
+        """Candidates, trials and what perception saw, as HTML."""
+        return str(_panel().evidence(self.words))
+
+
+def shown_steps(recording: Recording) -> list[ShownStep]:
+    """What is shown of each step; the camera's images are ray-cast again."""
+    painter = Painter(recording)
+    frames = (recorded_frame(step, recording.camera, recording.shelf) for step in recording.steps)
+    return [shown_step(recording, i, frame, painter) for i, frame in enumerate(frames)]
+
+
+def shown_step(
+    recording: Recording,
+    i: int,
+    frame: Frame,
+    painter: Painter,
+    words: Mapping[str, Any] | None = None,
+) -> ShownStep:
+    """What is shown of a step.
+
+    Args:
+      recording: of the episode.
+      i: index of the step.
+      frame: its picture.
+      painter: of the recording.
+      words: replace those of `step_words` of the same names.
+    """
+    step, before = recording.steps[i], recording.steps[i - 1] if i else None
+    # Before that, a caption says what the belief's words say.
+    why = frame.caption.partition(" · ")[2]
+    every = {"why": why, "warnings": (), **step_words(recording, i, frame), **(words or {})}
+    blocked, sure = texts.blocked(step), texts.confidence(step)
+    return ShownStep(
+        words=every,
+        recorded=step,
+        decision=shown_decision(step, frame, recording, painter.room),
+        above=painter.believed(step, frame, before, blocked),
+        perceived=painter.recognised(step, frame, sure) if every["shapes"] else None,
+        recognised=[(name, mesh, colour_of(float(sure[int(name)])), 0.45) for name, mesh in _meshes(step)],
+        blocked=[(name, mesh, MARK, 0.5) for name, mesh in _meshes(step, OFF) if int(name) in blocked],
+    )
+
+
+def _meshes(step: RecordedStep, off: float = 0.0) -> list[tuple[str, web.Mesh]]:
+    """The recognised shapes by their numbers, larger by a margin [m]."""
+    larger = step.scene.replace(size=np.asarray(step.scene.size) + off)
+    return [(str(i), mesh) for i, mesh in enumerate(web.meshes_of(larger)) if mesh is not None]
+
+
+def card(end: Ending, left_out: Sequence[str] = ()) -> str:
+    """How an episode ended, and why, as HTML."""
+    return str(_panel().card(end._asdict(), left_out))
+
+
+def title(heading: str) -> str:
+    """A heading, as HTML."""
+    return str(_panel().title(heading))
+
+
+def legend() -> str:
+    """What the colours of the map mean, as HTML."""
+    return str(_panel().legend(drawing.bands(), "Where the target can be, and what a grasp there would meet:"))
+
+
+@functools.cache
+def _panel() -> Any:
+    """The macros of the panel."""
+    templates = environment()
+    assert templates.loader is not None
+    templates.loader = jinja2.ChoiceLoader([templates.loader, jinja2.FileSystemLoader(_TEMPLATE.parent)])
+    templates.globals |= {**COLOURS, "nothing": "Nothing was compared, and nothing was tried out."}
+    return templates.get_template(_TEMPLATE.name).module
