@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import UInt8
@@ -66,7 +67,15 @@ def check_search(recording: Recording) -> None:
         )
 
 
-def both(films: Sequence[Film], titles: Sequence[str]) -> Iterator[Picture]:
+class Pictures(Protocol):
+    """A film: its size and its pictures."""
+
+    size: tuple[int, int]
+
+    def __iter__(self) -> Iterator[Picture]: ...
+
+
+def both(films: Sequence[Pictures], titles: Sequence[str]) -> Iterator[Picture]:
     """Pictures of films one above the other; one that has ended stands still."""
     last: list[Picture] = []
     strips = [title_strip(title, film.size[0]) for title, film in zip(titles, films, strict=True)]
