@@ -1,6 +1,7 @@
 """The guides' blocks of code: commands are parsed, files of settings read, and what a page tells to do is done."""
 
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -10,9 +11,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.problem.settings import load_settings
+from mechsearch_jax.workspace.scenario import COMPOUND_VERSION, FORMAT, parse_scenario
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -62,7 +65,7 @@ def named(page):
 
 def test_every_block_is_of_a_kind_that_is_tested():
     kinds = {(language, page.name) for page in PAGES for language, _ in blocks(page)}
-    assert {language for language, _ in kinds} == {"bash", "sh", "toml", "python"}
+    assert {language for language, _ in kinds} == {"bash", "sh", "toml", "python", "json"}
     assert {name for language, name in kinds if language == "python"} == {"README.md", *DONE[1:], *RUN}
 
 
@@ -106,6 +109,22 @@ def test_what_cannot_be_read_is_named_with_its_page(tmp_path, line, why):
     page.write_text(f"```sh\nmechsearch doctor\n{line}\n```\n")
     with pytest.raises(AssertionError, match=rf"page\.md: .*{why}"):
         test_commands_are_understood(page)
+
+
+def test_objects_of_scenario_files_are_read(tmp_path):
+    trimesh.creation.box((80.0, 80.0, 100.0)).export(tmp_path / "mug.obj")
+    target = {
+        "shape": "cylinder",
+        "half_size": [0.02, 0.02, 0.05],
+        "position": [0.6, 0, 0.46],
+        "quaternion": [1, 0, 0, 0],
+    }
+    texts = [text for page in PAGES for language, text in blocks(page) if language == "json"]
+    assert texts
+    for text in texts:
+        scene = {"format": FORMAT, "version": COMPOUND_VERSION, "name": "doc", "objects": [json.loads(text)]}
+        (body,) = parse_scenario({**scene, "target": target}, "a page", folder=tmp_path).objects
+        assert body.half_size == pytest.approx((0.04, 0.04, 0.05))
 
 
 def test_settings_in_files_are_read(tmp_path):

@@ -126,13 +126,13 @@ def test_depth_is_that_of_the_rays_of_mujoco(seed):
     seen = simulated_camera.observe(CAMERA, world.from_scenario(scene))
     made, bodies = compiled(scene)
     depth, owner = cast(made, model.initial_state(made, bodies), CAMERA, 2)
-    mine, shown = np.asarray(seen.depth)[::2, ::2], np.asarray(seen.segmentation)[::2, ::2]
+    computed, shown = np.asarray(seen.depth)[::2, ::2], np.asarray(seen.segmentation)[::2, ::2]
     same = shown == owner
     assert {*range(5), simulated_camera.SHELF} <= {*shown[same].tolist()}
     assert same.mean() > 0.995
     finite = same & np.isfinite(depth)
-    np.testing.assert_array_equal(np.isfinite(mine[same]), np.isfinite(depth[same]))
-    apart = np.abs(mine[finite] - depth[finite])
+    np.testing.assert_array_equal(np.isfinite(computed[same]), np.isfinite(depth[same]))
+    apart = np.abs(computed[finite] - depth[finite])
     assert np.quantile(apart, 0.99) < 2e-5
     assert apart.max() < 1e-3
 

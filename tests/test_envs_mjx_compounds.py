@@ -102,9 +102,9 @@ def _check_geometry(fields, w, slot, compiled):
         kind = next(n for n, p in PRIMITIVES.items() if TYPES[p.geometry] == int(own.type[0]))
         row = padded.geom(f"solid{slot}_{free[kind].pop(0)}").id
         for name in ("size", "rbound", "aabb", "pos", "friction"):
-            mine = np.asarray(getattr(fields, f"geom_{name}")[w, row]).reshape(-1)
+            computed = np.asarray(getattr(fields, f"geom_{name}")[w, row]).reshape(-1)
             np.testing.assert_allclose(
-                mine, np.ravel(getattr(compiled, f"geom_{name}")[g]), 1e-5, 1e-6, f"{kind} {name}"
+                computed, np.ravel(getattr(compiled, f"geom_{name}")[g]), 1e-5, 1e-6, f"{kind} {name}"
             )
         turns = [
             Rotation.from_quat(np.asarray(q), scalar_first=True).as_matrix()

@@ -130,7 +130,7 @@ MEANINGS = {
     "placements": "places that are tried for an object",
     "noises": "each scene's sensor is one of these",
     "engine": "the simulator",
-    "pushes": "that were asked for",
+    "pushes": "drawn for training",
     "found": "that were simulated",
     "held_out": "of these only used to score the network",
     "worlds": "simulated at a time",

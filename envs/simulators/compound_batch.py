@@ -169,14 +169,14 @@ def _rows(
     solids: Solids, there: Bool[Array, "w 8"], name: str
 ) -> tuple[Float[Array, "w 8 n 3"], Float[Array, "w 8 n 3"], Float[Array, "w 8 n 3 3"], Bool[Array, "w 8 n"]]:
     """Half-extents, position and rotation of the geometries of a kind, and which of them are used."""
-    mine = solids.valid & (solids.kind == PRIMITIVES[name].code) & there[..., None]
-    order = jnp.argsort(~mine, axis=-1, stable=True)[..., : ROWS[name]]
+    of_kind = solids.valid & (solids.kind == PRIMITIVES[name].code) & there[..., None]
+    order = jnp.argsort(~of_kind, axis=-1, stable=True)[..., : ROWS[name]]
 
     def taken(leaf: Array) -> Array:
         index = order.reshape(*order.shape, *[1] * (leaf.ndim - order.ndim))
         return jnp.take_along_axis(leaf, index, axis=2)
 
-    used = taken(mine)
+    used = taken(of_kind)
     half = jnp.where(used[..., None], taken(solids.half_size) - models.MARGIN, models.TINY)
     # What is not used hides inside the first solid.
     position = jnp.where(used[..., None], taken(solids.position), solids.position[:, :, :1])

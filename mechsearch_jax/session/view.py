@@ -29,6 +29,6 @@ class View(Protocol):
 
         Args:
           step: the last one that was shown.
-          ok: as `acted` was told.
+          ok: the argument of `acted`.
         """
         ...
