@@ -137,5 +137,6 @@ def test_policies_are_compared_on_fewer_scenes(tmp_path, monkeypatch):
     said, names = run("compare-policies", tmp_path, monkeypatch, [("SCENES = 50", "SCENES = 2")])
     assert [row.policy for row in names["rows"]] == ["search-for-grasp"] * 2 + ["free-or-not"] * 2
     assert not any(row.is_error for row in names["rows"])
-    assert {change.pairs for change in names["differences"].values() if change.pairs} == {2}
+    # Some are of episodes alone in which the target was found.
+    assert max(change.pairs for change in names["differences"].values()) == 2
     assert said.splitlines()[-1].endswith("of 2 scenes")
