@@ -97,13 +97,13 @@ def test_what_differs_between_runs_is_left_out_and_pictures_get_few_colours():
 
 
 def test_a_notebook_that_fails_or_grows_is_not_stored(tmp_path, monkeypatch):
-    path = tmp_path / "mine.ipynb"
+    path = tmp_path / "large.ipynb"
     path.write_text(json.dumps({"cells": [], "metadata": {}, "nbformat": 4, "nbformat_minor": 5}))
     before = path.read_bytes()
     large = {"cells": [{"cell_type": "markdown", "source": "x" * notebooks.LARGEST}], "metadata": {}}
     monkeypatch.setattr(notebooks, "executed", lambda notebook: large)
-    with pytest.raises(InputError, match=r"mine\.ipynb: has \d+ bytes, more than"):
-        notebooks.write("mine", tmp_path)
+    with pytest.raises(InputError, match=r"large\.ipynb: has \d+ bytes, more than"):
+        notebooks.write("large", tmp_path)
     assert path.read_bytes() == before
     with pytest.raises(SystemExit):
         notebooks.main(["yours", "--folder", str(tmp_path)])
