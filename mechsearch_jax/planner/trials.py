@@ -8,6 +8,7 @@ results, and `choose` takes the first that succeeds. `decide` runs this stage fo
 from __future__ import annotations
 
 import enum
+import math
 from typing import Protocol, runtime_checkable
 
 import flax.struct
@@ -28,6 +29,9 @@ from mechsearch_jax.runtime.compiled import kept
 
 # Largest number of first actions of sequences that are tried; for grasps see `retrieval.TRIES`.
 TRIES = 8
+# Two actions of the same kind and object are alike if the gripper begins within this of the other's place, also ends
+# within it [m], and approaches within this angle of it [rad].
+ALIKE, ALIKE_APPROACH = 0.02, math.radians(10)
 # Kinds of action that a plan may begin with.
 PLANNED = tuple(ActionKind(kind.code) for kind in SAMPLED_KINDS)
 
@@ -146,10 +150,43 @@ def grasps_to_try(actions: Action, worth: Bool[Array, " k"], now: Superquadrics,
 
 @kept()
 def sequences_to_try(sequences: Sequences, now: Superquadrics, reached: Float[Array, ""]) -> Alternatives:
-    """The alternatives of the first actions of the best sequences."""
-    first: Action = jax.tree.map(lambda a: a[:TRIES, 0], sequences.actions)
-    worth = (first.kind != ActionKind.NONE) & jnp.isfinite(sequences.value[:TRIES])
-    return Alternatives(first, worth, jnp.arange(len(worth), dtype=jnp.int32), now, reached)
+    """The alternatives of the first actions of the best sequences, up to `TRIES` of them, no two alike.
+
+    A trial of an action that is like another would only repeat its result. If fewer differ, the rest are not worth a
+    trial.
+
+    Args:
+      sequences: of a decision, best first.
+      now: the present objects.
+      reached: J if the target can be taken out.
+    """
+    first: Action = jax.tree.map(lambda a: a[:, 0], sequences.actions)
+    possible = (first.kind != ActionKind.NONE) & jnp.isfinite(sequences.value)
+    count = len(possible)
+
+    def pick(rank: Int[Array, " s"], _):
+        i = jnp.argmin(rank)
+        behind = _alike(first, jax.tree.map(lambda a: a[i], first)) & (rank < count)
+        return jnp.where(behind, rank + count, rank).at[i].set(2 * count), (i, rank[i] < count)
+
+    # From `count` on, what is not worth a trial, and then what was picked.
+    rank = jnp.arange(count) + jnp.where(possible, 0, count)
+    _, (best, worth) = jax.lax.scan(pick, rank, length=min(TRIES, count))
+    return Alternatives(jax.tree.map(lambda a: a[best], first), worth, best.astype(jnp.int32), now, reached)
+
+
+def _alike(actions: Action, action: Action) -> Bool[Array, " s"]:
+    """Which of S actions are like another; see `ALIKE`."""
+    near = [
+        jnp.sum((ends - end[None]) ** 2, axis=-1) < ALIKE**2
+        for ends, end in (
+            (actions.T_world_gripper[:, :3, 3], action.T_world_gripper[:3, 3]),
+            (actions.T_world_place[:, :3, 3], action.T_world_place[:3, 3]),
+        )
+    ]
+    cosine = jnp.sum(actions.T_world_gripper[:, :3, 2] * action.T_world_gripper[None, :3, 2], axis=-1)
+    same = (actions.kind == action.kind) & (actions.object == action.object)
+    return same & near[0] & near[1] & (cosine > math.cos(ALIKE_APPROACH))
 
 
 def in_turn(first: Alternatives, then: Alternatives) -> Alternatives:
