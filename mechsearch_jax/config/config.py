@@ -76,7 +76,7 @@ class PlannerConfig:
         it is worth more draws.
       move_again: whether an object may move more than once in a sequence, as in the paper; static.
       move_target: whether a found target may be pushed, too; static. Nothing else helps if every grasp of it hits an
-        object that can neither be grasped nor pushed.
+        object that can neither be grasped nor pushed, but that is too rare to gain anything.
       retrieval_contact: whether a grasp that hits objects may take a found target out if its trial succeeds; static.
         Not so in the paper. If False, only grasps that hit nothing are tried.
       predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
@@ -86,8 +86,8 @@ class PlannerConfig:
     """
 
     gamma: float = option(0.9, "discount of later actions, above 0 and at most 1")
-    horizon: int = option(3, "actions in a sequence; the paper's is 3")
-    sequences: int = option(30, "sequences that are sampled for a decision; the paper's is 30")
+    horizon: int = option(1, "actions in a sequence; the paper's is 3")
+    sequences: int = option(100, "sequences that are sampled for a decision; the paper's is 30")
     unseen_contact_penalty: float = option(
         1.0, "what an action costs that may touch the unseen target, as a share of J; the paper's is 0"
     )
@@ -100,7 +100,7 @@ class PlannerConfig:
     draws: int = option(1, "how often an action is drawn until one is possible")
     first_draws: int = option(4, "the same for the first action of a sequence, where that is more")
     move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
-    move_target: bool = option(True, "whether a found target may be pushed, too; not in the paper")
+    move_target: bool = option(False, "whether a found target may be pushed, too, as it may not in the paper")
     retrieval_contact: bool = option(
         True, "whether trials may take a found target out with a grasp that touches objects; not in the paper"
     )

@@ -30,8 +30,8 @@ class ExistenceConfig:
         cell's corners in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to alternating
         sides, and the corners of the outermost cells lie at the walls.
       closer_look: factor by which the image of a closer look is coarser than 1280 x 720, scaled likewise; 0 for none.
-      erosion: by how much the target is shrunk for the collision test [m]. A pushed target touches objects, often on
-        several sides, so that hardly any place of its cell would be free.
+      erosion: by how much the target is shrunk for the collision test [m]: a pushed target touches objects, often on
+        several sides, so that hardly any place of its cell would be free. That is too rare to gain anything.
       reopen: whether f is opened again around what an action may have moved unseen; see `belief.unseen_motion`.
       window: rows and columns of the window an object is rendered in, at the coarse resolution.
       points: points on the target's surface for the collision test.
@@ -52,7 +52,7 @@ class ExistenceConfig:
         3, "where few of the target's pixels show, they are counted again in an image this much coarser; 0 for never"
     )
     erosion: float = option(
-        0.001, "how deep a target that may be somewhere may reach into an object, on all sides [m]; the paper's is 0"
+        0.0, "how deep a target that may be somewhere may reach into an object, on all sides [m]; the paper's is 0"
     )
     reopen: bool = option(
         True, "whether f is opened again around what an action may have moved unseen; not in the paper"
