@@ -18,6 +18,7 @@ import jinja2
 
 from mechsearch_jax.benchmarks.report.results_page import table
 from mechsearch_jax.benchmarks.site.set_texts import ABOUT, CLUTTER, About, sets_of
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, SceneSet, digest, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
@@ -27,7 +28,7 @@ OUT = Path("docs/scene-sets")
 MEASURES = ("retrieved", "found", "graspable")
 # What variants on a set's page may differ in; others belong to studies.
 SHOWN = ("policy", "recognition", "protocol", "actions", "rehearsal", "retrieval_contact")
-_PRESETS = ("standard", "best", "published-code", "paper")
+_PRESETS = ("standard", *FORMER_STANDARDS, "best", "published-code", "paper")
 _WORDS = {
     "rehearsal=none": "without trials",
     "rehearsal=learning": "with trials that learn the friction",

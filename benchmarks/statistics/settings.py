@@ -9,6 +9,10 @@ from typing import Any, NamedTuple
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
+# What preset `standard` was before: by the name that it has since, the options that were other than today's.
+FORMER_STANDARDS: Mapping[str, Mapping[str, Any]] = {
+    "standard until 2026-11-26": {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001},
+}
 # Options that no preset decides.
 _NOT_OF_PRESETS = frozenset(("simulator", "target", "seed"))
 
@@ -17,7 +21,7 @@ class Settings(NamedTuple):
     """The settings of a variant.
 
     Attributes:
-      preset: the preset that differs from them in the fewest options.
+      preset: the preset that differs from them in the fewest options, or one of `FORMER_STANDARDS`.
       differing: what is not as in that preset, with search-for-grasp, true shapes and protocol strict; None is the
         value of an option that the variant does not have.
     """
@@ -28,7 +32,8 @@ class Settings(NamedTuple):
 
 @functools.cache
 def _preset_options(name: str) -> Mapping[str, Any]:
-    return Method(config=PRESETS[name]()).options()
+    config = PRESETS["standard"](**FORMER_STANDARDS[name]) if name in FORMER_STANDARDS else PRESETS[name]()
+    return Method(config=config).options()
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -36,7 +41,8 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
 
     An option that the row does not have is of a later version, and is taken to be as in the preset.
     """
-    candidates = [Settings(name, _differing(options, _preset_options(name))) for name in PRESETS]
+    names = (*PRESETS, *FORMER_STANDARDS)
+    candidates = [Settings(name, _differing(options, _preset_options(name))) for name in names]
     return min(candidates, key=lambda settings: len(settings.differing))
 
 

@@ -1,16 +1,19 @@
 """The studies that there are.
 
 Ablations run on `development`, since they choose what the default has, and `extensions-full`, which chooses, too, on
-scenes that were looked at before; all others on scenes that nothing was chosen on.
+scenes that were looked at before; all others on scenes that nothing was chosen on. Those of before a default changed
+are around the former one: what is stored of them is of it, and so is what runs again.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.world.mismatch import Mismatch
@@ -376,15 +379,29 @@ _ROBUSTNESS = (
 )
 
 
+def _around(former: str, studies: Sequence[Study]) -> tuple[Study, ...]:
+    """Studies around a former default, of which presets `standard` and `best` were made."""
+    before = FORMER_STANDARDS[former]
+
+    def own(variant: Variant) -> Variant:
+        made_of_it = variant.options.get("preset", "standard") in ("standard", "best")
+        return dataclasses.replace(variant, options={**(before if made_of_it else {}), **variant.options})
+
+    return tuple(dataclasses.replace(s, variants=tuple(map(own, s.variants)), around=former) for s in studies)
+
+
+_FORMER = "standard until 2026-11-26"
+
+
 def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
     return {study.name: study for group in groups for study in group}
 
 
 # By what they are for, in the order of the page.
 GROUPS: Mapping[str, Sequence[Study]] = {
-    "Ablations": _ABLATIONS,
-    "On new scenes": _CONFIRMATIONS,
-    "Baselines": _BASELINES,
-    "Robustness": _ROBUSTNESS,
+    "Ablations": _around(_FORMER, _ABLATIONS),
+    "On new scenes": _around(_FORMER, _CONFIRMATIONS),
+    "Baselines": _around(_FORMER, _BASELINES),
+    "Robustness": _around(_FORMER, _ROBUSTNESS),
 }
 STUDIES: Mapping[str, Study] = _by_name(*GROUPS.values())

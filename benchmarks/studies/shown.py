@@ -95,8 +95,9 @@ def source(shown_study: ShownStudy) -> str:
     main, *others = (f"[{name}](../benchmarks/results/runs/{name}.jsonl)" for name in shown_study.labels)
     labels = list(shown_study.labels.values())[1:]
     more = "".join(f"; from {run}: {', '.join(each)}" for run, each in zip(others, labels, strict=True))
+    around = f" around `{study.around}`" if study.around else ""
     return (
-        f"`mechsearch study {study.name}` with {with_seeds}; {part}`{study.scenes}`, scenes that "
+        f"`mechsearch study {study.name}` with {with_seeds}{around}; {part}`{study.scenes}`, scenes that "
         f"{which}; {devices}; {', '.join(sorted({row.code for row in rows}))}; its command stands in "
         f"{main}{more}.{lacks}"
     )
