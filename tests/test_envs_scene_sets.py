@@ -84,6 +84,7 @@ DIGESTS = {
     "report-b": "9fdf4ce1d5b9",
     "report-c": "13ad36aa6f21",
     "report-d": "d353835947b1",
+    "report-e": "0241abbdcdcb",
     "shelf-low": "f547905348d9",
     "shelf-narrow": "aaa051492858",
     "shelf-wide": "32c83e4f2af2",

@@ -18,7 +18,7 @@ from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import policies
 
-# Equations and loops (`while`, `scan` and `cond`) of one decision: 30 sequences of 3 actions, 9 slots. The programs for
+# Equations and loops (`while`, `scan` and `cond`) of one decision of the default, with 9 slots. The programs for
 # a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found; and those of
 # scenes with room for bodies of several parts.
 BUDGET = {
@@ -74,7 +74,7 @@ def test_what_is_inside_loops_and_calls_counts_each_time():
 
 def decision(problem, belief, parts=None):
     """The program of a decision for a belief, with room for so many parts of each body."""
-    settings = ms.search_for_grasp(sequences=30, horizon=3)
+    settings = ms.search_for_grasp()
     seen = Observation(objects=superquadric.empty(8, parts), target_visible=jnp.array(False), target_pose=jnp.zeros(3))
     plan = lambda key, problem, belief: policies._plan.__wrapped__(settings, key, problem, belief, seen)  # noqa: E731
     return jax.make_jaxpr(plan)(jax.random.key(0), problem, belief).jaxpr

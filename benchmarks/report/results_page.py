@@ -17,6 +17,7 @@ from typing import Any
 from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
 from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.episode.method import Method
@@ -26,8 +27,10 @@ from mechsearch_jax.runtime.files import PathLike
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
-# Without -h100.
-IMAGE_RUNS = ("table1-h100", "seeds-h100", "collision-free-h100", "images-h200", "confirmation-h200")
+# Of today's default, and of the former one with collision-free grasps alone. The page has them without what ran it.
+RUNS = ("table1-h200", "first-actions-h200", "collision-free-h100")
+# The default that some figures are still of.
+FORMER = "standard until 2026-11-26"
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -171,51 +174,42 @@ def _on_new_scenes(runs: Iterable[StoredRun], method: Method) -> list[Episode]:
     return [vars(row) for row in rows if all(options_of(row).get(name) == value for name, value in settings.items())]
 
 
-def from_images(
-    table1: StoredRun, seeds: StoredRun, collision_free: StoredRun, images: StoredRun, confirmation: StoredRun
-) -> dict[str, Any]:
-    """The fields of the template about the default from images."""
-    usual = Method(recognition="masks")
-    grasps = dataclasses.replace(usual, config=usual.config.with_options(retrieval_contact=False))
-    full = dataclasses.replace(usual, recognition="full")
-    groups = {
-        "`masks`, 4 seeds": _on_new_scenes([table1, seeds], usual),
-        "`masks`, collision-free grasps only, 4 seeds": _on_new_scenes([collision_free], grasps),
-        "`full`, `report-b`, 2 seeds": _on_new_scenes([images], full),
+def default_rates(table1: StoredRun, first_actions: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
+    """The fields of the template about what the default reaches, with true shapes and from images."""
+    usual = Method()
+    masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
+    former = usual.config.with_options(**FORMER_STANDARDS[FORMER], retrieval_contact=False)
+    grasps = dataclasses.replace(masks, config=former)
+    default = {
+        "`c2` 090 to 179": _on_new_scenes([table1], usual),
+        "`report-c`, `report-d`": _on_new_scenes([first_actions], usual),
     }
-    others = {
-        "images_true": (images, Method()),
-        "others_full": (confirmation, full),
-        "others_true": (confirmation, Method()),
-    }
-    retrieved = {
-        name: [reached(with_objects(_on_new_scenes([run], method), count), "retrieved") for count in COUNTS]
-        for name, (run, method) in others.items()
+    images = {
+        "`masks`, `c2`, 4 seeds": _on_new_scenes([table1], masks),
+        f"`masks`, `c2`, 4 seeds, collision-free grasps only, {FORMER}": _on_new_scenes([collision_free], grasps),
+        "`full`, `c2`": _on_new_scenes([table1], full),
+        "`full`, `report-c`, `report-d`": _on_new_scenes([first_actions], full),
     }
     return {
-        "image_rates": rates("recognition", groups),
-        **{name: ", ".join(map(share, flags)) for name, flags in retrieved.items()},
+        "default_rates": rates("scenes", default),
+        "default_mishaps": mishaps(default),
+        "image_rates": rates("recognition", images),
+        "image_mishaps": mishaps({"`full`, `report-c`, `report-d`": images["`full`, `report-c`, `report-d`"]}),
     }
 
 
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template that are no values of a file."""
-    new, published = (stored.run("standard-h100", name) for name in ("c2", "published"))
+    new = stored.run("standard-h100", "c2")
     paper = stored.run("published-paper-h200", "search-for-grasp")
-    default = {
-        "new: `c2` 090 to 179": [each for each in new["episodes"] if not is_chosen_on(each["scenario"])],
-        "development: published": published["episodes"],
-    }
-    runs = [load_run(stored.folder / "runs", name) for name in IMAGE_RUNS]
+    runs = [load_run(stored.folder / "runs", name) for name in RUNS]
     clock = new["clock"]["nothing kept"]
     frictions = {"same": "X1", "half": "X5", "double": "X2"}
     starts = stored["scenes-start-cpu"]["summary"]
     return {
-        **{"new": new, "published": published, "paper": paper},
-        "default_rates": rates("scenes", default),
-        "default_mishaps": mishaps(default),
-        **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(IMAGE_RUNS, runs, strict=True)},
-        **from_images(*runs),
+        **{"new": new, "paper": paper},
+        **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
+        **default_rates(*runs),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),

@@ -231,6 +231,24 @@ _CONFIRMATIONS = (
     ),
 )
 
+# Around today's default.
+_DEFAULT = (
+    Study(
+        "first-actions",
+        "How many first actions are worth comparing, and how far ahead, where the eight that are tried differ?",
+        DEFAULT_SCENES,
+        (
+            Variant("100, full", _FULL),
+            Variant("300, full", {**_FULL, "sequences": 300}),
+            Variant("30 of three actions, full", {**_FULL, **_THREE_AHEAD}),
+            Variant("100, true shapes"),
+            Variant("300, true shapes", {"sequences": 300}),
+            Variant("30 of three actions, true shapes", _THREE_AHEAD),
+        ),
+        chooses=True,
+    ),
+)
+
 _BASELINES = (
     Study(
         "baselines",
@@ -400,7 +418,7 @@ def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
 # By what they are for, in the order of the page.
 GROUPS: Mapping[str, Sequence[Study]] = {
     "Ablations": _around(_FORMER, _ABLATIONS),
-    "On new scenes": _around(_FORMER, _CONFIRMATIONS),
+    "On new scenes": (*_around(_FORMER, _CONFIRMATIONS), *_DEFAULT),
     "Baselines": _around(_FORMER, _BASELINES),
     "Robustness": _around(_FORMER, _ROBUSTNESS),
 }
