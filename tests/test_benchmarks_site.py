@@ -130,7 +130,7 @@ def test_sets_on_one_page_have_rates_of_their_own():
     lines = [{**line(2, 0.9), "scene_set": "report-b"}]
     text = set_pages.page("report", lines, ROOT / "benchmarks/results")
     first, second, *rest = text.split("## Rates on ")[1:]
-    nothing = [f"`report-{letter}`\n\nNothing that is stored ran on it yet." for letter in "acd"]
+    nothing = [f"`report-{letter}`\n\nNothing that is stored ran on it yet." for letter in "acde"]
     assert [each.strip() for each in (first, *rest)] == nothing
     assert "| `standard` | 10 | 0.50" in second
     assert "mechsearch evaluate report-a --out rows" in text
@@ -286,4 +286,4 @@ def test_a_gallery_is_drawn_of_the_recordings_that_are_there(tmp_path, monkeypat
     monkeypatch.setattr(gallery.subprocess, "run", lambda program: types.SimpleNamespace(returncode=3))
     with pytest.raises(SystemExit):
         gallery.main(["crowded", "--out", str(tmp_path)])
-    assert "mechsearch search crowded-shelf --out" in capsys.readouterr().err
+    assert "mechsearch search crowded-shelf --horizon 3" in capsys.readouterr().err

@@ -89,6 +89,11 @@ def pushes():
     return over, away, aside
 
 
+def higher(action):
+    """An action 3 cm higher, which is tried beside the other."""
+    return action.replace(T_world_gripper=action.T_world_gripper.at[2, 3].add(0.03))
+
+
 def planned(*actions):
     """A plan whose best sequences begin with these actions."""
 
@@ -219,7 +224,8 @@ def says(*codes):
 def test_where_everything_does_harm_nothing_is_done(problem):
     over, *_ = pushes()
     belief, observation = look(problem, EDGE, found=False)
-    for actions, refused in (((over, over), 2), ((no_action(),), 0)):
+    # What is like another is not tried, and refused with it.
+    for actions, refused in (((over, over), 1), ((over, higher(over)), 2), ((no_action(),), 0)):
         decision = made(proposes(*actions), MODEL, problem, belief, observation)
         assert (int(decision.action.kind), int(decision.refused)) == (ActionKind.NONE, refused)
         assert (float(decision.value), float(decision.predicted_cost)) == (math.inf, 20.0)
@@ -236,7 +242,8 @@ def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
         ((FAILED, HARM, FAILED, HARM), (0, 2), 2),
         ((UNKNOWN, FAILED, UNKNOWN, FAILED), (1, 3), 2),
     ):
-        decision = made(proposes(over, aside, over, aside), says(*codes), problem, belief, observation)
+        four = (over, aside, higher(over), higher(aside))
+        decision = made(proposes(*four), says(*codes), problem, belief, observation)
         value, after = np.asarray(decision.sequences.value), decision.sequences.after
         assert value[: len(order)].tolist() == [i - 10.0 for i in order]
         assert np.isinf(value[len(order) :]).all()
@@ -251,7 +258,7 @@ def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
 def test_what_is_not_known_is_never_made(problem):
     _, _, aside = pushes()
     belief, observation = look(problem, EDGE, found=False)
-    decision = made(proposes(aside, aside), says(), problem, belief, observation)
+    decision = made(proposes(aside, higher(aside)), says(), problem, belief, observation)
     assert (int(decision.action.kind), int(decision.refused)) == (ActionKind.NONE, 2)
 
 

@@ -53,8 +53,8 @@ class Sequences(flax.struct.PyTreeNode):
     """Sampled sequences of actions, best first; leading axis S, and M within.
 
     Attributes:
-      actions: shape (S, M), of kind NONE after the last possible action; all NONE if the first was refused because it
-        did harm in a trial.
+      actions: shape (S, M), of kind NONE after the last possible action; all NONE if the first was refused because it,
+        or one like it, did harm in a trial.
       cost: J after each action, shape (S, M).
       value: equation 2 of the best prefix, shape (S,); infinite if there was no first action, or it was refused.
       length: number of actions in that prefix, shape (S,).
@@ -101,7 +101,7 @@ class Decision(flax.struct.PyTreeNode):
       predicted: the predicted objects after the action, without the target, fields (N, ...).
       sequences: all sampled sequences, the chosen one first, then best first; without first actions if none was
         sampled.
-      refused: number of the best sequences whose first action did harm in a trial.
+      refused: number of actions that were tried and refused.
       alternatives: actions to try instead; None if the policy gives none.
     """
 

@@ -8,6 +8,7 @@ results, and `choose` takes the first that succeeds. `decide` runs this stage fo
 from __future__ import annotations
 
 import enum
+import functools
 import math
 from typing import Protocol, runtime_checkable
 
@@ -205,7 +206,8 @@ def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
 
     The first alternative that succeeds is chosen. If none does: a retrieval that the decision already makes is kept;
     else the first alternative that begins a sequence and did no harm is chosen; else nothing. Sequences whose first
-    action did harm, or has an unknown result, are refused. A decision without alternatives stays unchanged.
+    action did harm, or has an unknown result, or is like one of these, are refused. A decision without alternatives
+    stays unchanged.
 
     Args:
       decision: decision of a policy.
@@ -224,9 +226,11 @@ def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
     # Alternatives after the first success were not tried.
     order = jnp.arange(results.shape[0])
     rejected = alternatives.worth & ~grasps & ((order < best) | ~succeeds) & (results <= TrialResult.HARMFUL)
-    place = jnp.where(grasps, sequences.value.shape[0], alternatives.sequence)
-    refused = jnp.zeros(sequences.value.shape, bool).at[place].set(rejected, mode="drop")
+    first = jax.tree.map(lambda a: a[:, 0], sequences.actions)
+    alike = jax.vmap(functools.partial(_alike, first))(alternatives.actions) & rejected[:, None]
+    refused = jnp.any(alike, axis=0)
     planned = _planned(decision, alternatives.now, refused, alternatives.sequence[best], harmless & ~grasps[best])
+    planned = planned.replace(refused=jnp.sum(rejected))
     taken = _taken(decision, alternatives, jax.tree.map(lambda a: a[best], alternatives.actions))
     grasped = succeeds & grasps[best]
 
@@ -256,7 +260,6 @@ def _planned(
         predicted_cost=jnp.where(acts, sequences.cost[0, 0], decision.cost),
         predicted=jax.tree.map(lambda a, b: jnp.where(acts, a[0], b), sequences.after, now),
         sequences=sequences,
-        refused=jnp.sum(refused),
     )
 
 
