@@ -360,10 +360,8 @@ def test_the_times_of_a_decision_are_the_stored_ones():
     readme = " ".join(read("README.md").split())
     runs = json.loads(read("benchmarks/results/plan-batch-h100.json"))["runs"]
     (alone,) = [1000 * run["median_seconds"] for run in runs if (run["code"], run["batch"]) == ("after", 1)]
-    assert (
-        f"A decision, of that former default, takes [{alone:.0f} ms on one H100](benchmarks/results/plan-batch-h100.json)"
-        in readme
-    )
+    file = "benchmarks/results/plan-batch-h100.json"
+    assert f"A decision, of that former default, takes [{alone:.0f} ms on one H100]({file})" in readme
     # With what is tried out.
     for file in (ROOT / "benchmarks/results").glob("plan-rehearsal-*.json"):
         assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme

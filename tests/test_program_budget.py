@@ -22,12 +22,12 @@ from mechsearch_jax.planner import policies
 # a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found; and those of
 # scenes with room for bodies of several parts.
 BUDGET = {
-    ("cpu", "hidden"): (16_416, 58),
-    ("cpu", "found"): (18_107, 74),
-    ("gpu", "hidden"): (18_244, 65),
-    ("gpu", "found"): (19823, 83),
-    ("cpu", "hidden", "parts"): (35_050, 94),
-    ("gpu", "found", "parts"): (37_489, 103),
+    ("cpu", "hidden"): (16_391, 58),
+    ("cpu", "found"): (18_076, 74),
+    ("gpu", "hidden"): (18_391, 73),
+    ("gpu", "found"): (19_965, 91),
+    ("cpu", "hidden", "parts"): (34_984, 94),
+    ("gpu", "found", "parts"): (37_628, 109),
 }
 # Versions of JAX write the same program with a few equations more or less.
 SLACK = 1.01
