@@ -27,7 +27,7 @@ from mechsearch_jax.runtime.files import PathLike
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
-# Of today's default, and of the former one with collision-free grasps alone. The page has them without what ran it.
+# Of today's default, and of the former one with collision-free grasps alone. Fields of the page are named after them.
 RUNS = ("table1-h200", "first-actions-h200", "collision-free-h100")
 # The default that some figures are still of.
 FORMER = "standard until 2026-11-26"

@@ -245,12 +245,13 @@ def _planned(
 ) -> Decision:
     """The decision to begin the sequence `index` if `acts`, else to do nothing; without the refused sequences."""
     sequences = decision.sequences
+    chosen = (jnp.arange(len(refused)) == index) & acts
+    refused = refused & ~chosen
     ruled_out = sequences.replace(
         actions=sequences.actions.replace(kind=jnp.where(refused[:, None], ActionKind.NONE, sequences.actions.kind)),
         value=jnp.where(refused, jnp.inf, sequences.value),
         after=jax.tree.map(lambda a, b: jnp.where(refused.reshape(-1, *[1] * b.ndim), b, a), sequences.after, now),
     )
-    chosen = (jnp.arange(len(refused)) == index) & acts
     order = jnp.argsort(jnp.where(chosen, -jnp.inf, ruled_out.value), stable=True)
     sequences = jax.tree.map(lambda a: a[order], ruled_out)
     first: Action = jax.tree.map(lambda a: a[0, 0], sequences.actions)
