@@ -314,6 +314,8 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
     assert compiled == []
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_who_compiles_kernels_says_where_it_cannot(tmp_path, monkeypatch):
     import warp
 
