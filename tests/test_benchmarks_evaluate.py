@@ -287,6 +287,8 @@ def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypa
     assert row.failure == "error: RuntimeError: gamma 0.25 arrived"
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_workers_that_die_hang_or_fail_cost_one_row_each(tmp_path, files):
     for name in ("crash", "exit", "hang"):
         save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
@@ -308,6 +310,8 @@ def broken(job):
     """No worker has this: it is no function of a module that they find."""
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_workers_that_cannot_be_started_end_the_run(tmp_path, files, monkeypatch):
     broken.__module__ = "nobody.there"
     monkeypatch.setitem(sys.modules, "nobody", types.ModuleType("nobody"))
@@ -317,6 +321,8 @@ def test_workers_that_cannot_be_started_end_the_run(tmp_path, files, monkeypatch
     assert read_rows(tmp_path / "rows") == []
 
 
+@pytest.mark.slow
+@pytest.mark.always
 @pytest.mark.parametrize("how", ["an interrupt", "a kill"])
 def test_workers_end_with_the_run_whatever_they_are_doing(tmp_path, files, how):
     save_scenario(Scenario("hang", (), TARGET), tmp_path / "hang.json")

@@ -47,6 +47,8 @@ def test_the_command_reports_all_rows():
     assert report_bench.timings_table(value).row_count == 2
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_a_report_that_fails_is_no_timing(tmp_path, capfd):
     with pytest.raises(InputError, match="ended with status 2"):
         report_bench.time_report("report", tmp_path / "none", tmp_path / "out")

@@ -253,6 +253,8 @@ def run_and_kill(tmp_path, kills, seed):
     assert sorted(stored.column("episode").to_pylist()) == sorted(results.rows)
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_nothing_is_missing_or_double_after_kills(tmp_path):
     run_and_kill(tmp_path, 8, 0)
 

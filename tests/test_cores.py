@@ -51,6 +51,8 @@ def test_processes_share_them(monkeypatch, processes, each):
     assert share_of_cores(processes) == {VARIABLE: each}
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_workers_are_given_their_share(monkeypatch):
     monkeypatch.setenv(VARIABLE, "6")
     jobs = make_jobs([example_scenarios()["first-light"]], [Method()], (0, 1))

@@ -7,6 +7,7 @@ import dataclasses
 import math
 import sys
 import types
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +69,8 @@ def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     worlds = stack(*[from_scenario(s) for s in scenes])
     moved = Mismatch(friction=0.5, mass=2.0, friction_spread=2.0, mass_spread=1.5, shelf_shift=0.01, shelf_turn=2.0)
     cells = [ASSUMED_CELL, moved.drawn(scenes[1], 0, Camera(), Shelf()), ActualCell(friction=2.0)]
-    fields = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid, cells_of(blank, cells))
+    of_worlds = jax.jit(partial(body_fields, blank))
+    fields = of_worlds(worlds.kind, worlds.half_size, worlds.valid, cells_of(blank, cells))
     for i, (start, cell) in enumerate(zip(scenes, cells, strict=True)):
         native = NativeWorld()
         native.place(slots(start), cell)
@@ -314,6 +316,8 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
     assert compiled == []
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_who_compiles_kernels_says_where_it_cannot(tmp_path, monkeypatch):
     import warp
 

@@ -1,6 +1,7 @@
 """Bodies of several parts: they are hit and seen where any part is, whatever the order of the parts."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -36,26 +37,40 @@ def drawn(seed, bodies_count=3, parts=3):
     """Bodies of upright and tilted parts on the board, some of them absent, the last body altogether."""
     rng = np.random.default_rng(seed)
     shape = (bodies_count, parts)
-    turn = jax.vmap(jax.vmap(exponential))(jnp.float32(rng.uniform(-0.6, 0.6, (*shape, 3))))
-    of_body = Superquadrics(
-        size=jnp.float32(rng.uniform(0.01, 0.05, (*shape, 3))),
-        exponents=jnp.float32(np.array([BOX, CYLINDER, (1.0, 1.0)])[rng.integers(0, 3, shape)]),
-        position=jnp.float32(rng.uniform(-0.05, 0.05, (*shape, 3))),
-        rotation=turn,
-        valid=jnp.asarray((rng.random(shape) < 0.7) & (np.arange(bodies_count) < bodies_count - 1)[:, None]),
-    )
-    place = jnp.float32(rng.uniform([0.5, -0.1, 0.45], [0.7, 0.3, 0.5], (bodies_count, 3)))
-    return bodies.bodies_of(of_body, place, yaw_rotation(jnp.float32(rng.uniform(-3, 3, bodies_count))))
+    turn = np.float32(rng.uniform(-0.6, 0.6, (*shape, 3)))
+    size = np.float32(rng.uniform(0.01, 0.05, (*shape, 3)))
+    exponents = np.float32(np.array([BOX, CYLINDER, (1.0, 1.0)])[rng.integers(0, 3, shape)])
+    position = np.float32(rng.uniform(-0.05, 0.05, (*shape, 3)))
+    valid = (rng.random(shape) < 0.7) & (np.arange(bodies_count) < bodies_count - 1)[:, None]
+    place = np.float32(rng.uniform([0.5, -0.1, 0.45], [0.7, 0.3, 0.5], (bodies_count, 3)))
+    return composed(size, exponents, position, turn, valid, place, np.float32(rng.uniform(-3, 3, bodies_count)))
+
+
+@jax.jit
+def composed(size, exponents, position, turn, valid, place, yaw):
+    """Bodies at places in the world, of parts that are turned by vectors within them."""
+    parts = Superquadrics(size, exponents, position, jax.vmap(jax.vmap(exponential))(turn), valid)
+    return bodies.bodies_of(parts, place, yaw_rotation(yaw))
 
 
 def permuted(scene, seed):
     order = np.random.default_rng(seed).permutation(scene.parts.capacity)
-    return scene.replace(parts=jax.tree.map(lambda a: a[:, order], scene.parts))
+    return scene.replace(parts=jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[:, order]), scene.parts))
+
+
+# Operations that run one by one are each compiled alone; these are called with many scenes.
+bodies_of, world_parts, any_part, prints = map(
+    jax.jit, (bodies.bodies_of, bodies.world_parts, bodies.any_part, footprints)
+)
+with_parts, surfaces = (jax.jit(function, static_argnums=1) for function in (bodies.with_parts, bodies.surfaces))
+depth, gauge = jax.jit(partial(render.render_depth, COARSE)), jax.jit(superquadric.gauge)
+support, sample_surface = jax.jit(superquadric.support), jax.jit(superquadric.sample_surface, static_argnums=2)
+to_object_frame, surface_of = jax.jit(superquadric.to_object_frame), jax.jit(bodies.surface_of, static_argnums=2)
 
 
 def single(seed):
     """Bodies of one superquadric each."""
-    return bodies.world_parts(drawn(seed, parts=1))
+    return world_parts(drawn(seed, parts=1))
 
 
 CLOUDS = clouds_of(jnp.float32(np.random.default_rng(0).uniform(-0.02, 0.02, (2, 3, 64))))
@@ -92,26 +107,26 @@ def same(a, b):
 @given(seeds)
 def test_one_part_changes_no_hit_view_or_footprint(seed):
     scene = single(seed)
-    split = bodies.with_parts(scene)
+    split = with_parts(scene, bodies.PARTS)
     assert split.parts.capacity == bodies.PARTS
     for answer in (hits, touched, windows):
         same(answer(scene), answer(split))
-    same(footprints(scene), footprints(split).replace(parts=None))
-    same(render.render_depth(COARSE, scene), render.render_depth(COARSE, split))
+    same(prints(scene), prints(split).replace(parts=None))
+    same(depth(scene), depth(split))
 
 
 @quick
 @given(seeds)
 def test_two_identical_parts_are_one(seed):
     scene = single(seed)
-    twice = bodies.with_parts(scene, 2)
-    twice = twice.replace(parts=jax.tree.map(lambda a: a[:, [0, 0]], twice.parts))
-    for answer in (hits, touched, windows, lambda some: bodies.surfaces(some, 64)[:-1]):
+    twice = with_parts(scene, 2)
+    twice = twice.replace(parts=jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[:, [0, 0]]), twice.parts))
+    for answer in (hits, touched, windows, lambda some: np.asarray(surfaces(some, 64))[:-1]):
         same(answer(scene), answer(twice))
-    again = bodies.bodies_of(twice.parts, twice.position, twice.rotation)
-    there = np.asarray(scene.valid)
+    again = bodies_of(twice.parts, twice.position, twice.rotation)
+    again, scene = jax.device_get((again, scene))
     for name in ("size", "exponents", "position", "rotation"):
-        np.testing.assert_allclose(getattr(again, name)[there], getattr(scene, name)[there], atol=1e-6)
+        np.testing.assert_allclose(getattr(again, name)[scene.valid], getattr(scene, name)[scene.valid], atol=1e-6)
 
 
 @quick
@@ -119,10 +134,10 @@ def test_two_identical_parts_are_one(seed):
 def test_the_order_of_parts_does_not_count(seed, other):
     scene = drawn(seed)
     swapped = permuted(scene, other)
-    for answer in (hits, touched, windows, footprints):
+    for answer in (hits, touched, windows, prints):
         a, b = answer(scene), answer(swapped)
-        same(*(x.replace(parts=None) if answer is footprints else x for x in (a, b)))
-    again = bodies.bodies_of(swapped.parts, swapped.position, swapped.rotation)
+        same(*(x.replace(parts=None) if answer is prints else x for x in (a, b)))
+    again = bodies_of(swapped.parts, swapped.position, swapped.rotation)
     same(again.replace(parts=None), scene.replace(parts=None))
 
 
@@ -131,39 +146,41 @@ def test_the_order_of_parts_does_not_count(seed, other):
 def test_a_body_is_hit_and_seen_as_its_parts_are_one_by_one(seed):
     scene = drawn(seed)
     # Far apart, too.
-    wide = scene.replace(parts=scene.parts.replace(position=3.0 * scene.parts.position))
+    wide = scene.replace(parts=scene.parts.replace(position=3.0 * np.asarray(scene.parts.position)))
     for body in (scene, wide):
-        alone = bodies.world_parts(body)
-        np.testing.assert_array_equal(hits(body), bodies.any_part(body, hits(alone)))
-        np.testing.assert_array_equal(touched(body)[0], bodies.any_part(body, touched(alone)[0]))
-        same(render.render_depth(COARSE, body), render.render_depth(COARSE, alone))
+        alone = world_parts(body)
+        np.testing.assert_array_equal(hits(body), any_part(body, hits(alone)))
+        np.testing.assert_array_equal(touched(body)[0], any_part(body, touched(alone)[0]))
+        same(depth(body), depth(alone))
 
 
 def test_a_window_shows_what_the_whole_image_shows_of_a_body():
     scene = drawn(5)
     shown = windows(scene)
     assert int(jnp.max(shown.stride)) == 1
-    same(render.merge_windows(COARSE, shown), render.render_depth(COARSE, scene))
+    same(render.merge_windows(COARSE, shown), depth(scene))
 
 
 @quick
 @given(seeds)
 def test_a_body_lies_within_its_bounding_superquadric(seed):
     scene = drawn(seed, parts=2)
-    points = bodies.surfaces(scene, 200)
-    outermost = superquadric.gauge(scene.size[:, None], scene.exponents[:, None], points)
+    points = np.asarray(surfaces(scene, 200))
+    scene = jax.device_get(scene)
+    outermost = gauge(scene.size[:, None], scene.exponents[:, None], points)
     # To a per cent, or the rounded edges of a box.
     assert np.all(np.where(scene.valid[:, None], outermost, 0.0) < 1.13)
-    reach = np.max(np.abs(points), axis=1)[np.asarray(scene.valid)]
-    assert np.all(reach <= np.asarray(scene.size)[np.asarray(scene.valid)] + 1e-6)
+    reach = np.max(np.abs(points), axis=1)[scene.valid]
+    assert np.all(reach <= scene.size[scene.valid] + 1e-6)
     np.testing.assert_array_equal(scene.valid, np.any(scene.parts.valid, axis=1))
 
 
 def two_parts(first, second):
     """A body of two parts, given by half-extents, exponents and places."""
-    size, exponents, position = (jnp.float32([a, b]) for a, b in zip(first, second, strict=True))
-    parts = Superquadrics(size, exponents, position, jnp.broadcast_to(jnp.eye(3), (2, 3, 3)), jnp.ones(2, bool))
-    return bodies.bodies_of(parts, jnp.zeros(3), jnp.eye(3))
+    size, exponents, position = (np.float32([a, b]) for a, b in zip(first, second, strict=True))
+    turn = np.broadcast_to(np.eye(3, dtype=np.float32), (2, 3, 3))
+    parts = Superquadrics(size, exponents, position, turn, np.ones(2, bool))
+    return bodies_of(parts, np.zeros(3, np.float32), np.eye(3, dtype=np.float32))
 
 
 def test_a_bottle_is_bounded_by_a_cylinder_and_a_mug_by_a_box():
@@ -182,24 +199,24 @@ def test_parts_move_with_their_body():
     T = make(yaw_rotation(jnp.float32(0.7)), jnp.float32([0.1, -0.2, 0.05]))
     place = transform(T, scene.position)
     turn = jnp.einsum("ij,njk->nik", T[:3, :3], scene.rotation, precision="highest")
-    moved = bodies.world_parts(scene.replace(position=place, rotation=turn))
-    still = bodies.world_parts(scene)
+    moved = world_parts(scene.replace(position=place, rotation=turn))
+    still = world_parts(scene)
     np.testing.assert_allclose(moved.position, transform(T, still.position), atol=1e-6)
 
 
 def test_parts_that_there_are_share_the_points_of_a_body():
-    scene = drawn(7)
-    points, valid = bodies.surfaces(scene, 96), np.asarray(scene.parts.valid)
+    scene = jax.device_get(drawn(7))
+    points, valid = np.asarray(surfaces(scene, 96)), scene.parts.valid
     assert not valid[:2].all()
     assert valid[:2].any(axis=1).all()
     for i in range(2):
         own = jax.tree.map(lambda a, i=i: a[i], scene.parts)
-        local = superquadric.to_object_frame(own, points[i])
-        near = np.abs(np.asarray(superquadric.gauge(own.size, own.exponents, local)) - 1.0) < 1e-3
+        local = to_object_frame(own, points[i])
+        near = np.abs(np.asarray(gauge(own.size, own.exponents, local)) - 1.0) < 1e-3
         np.testing.assert_array_equal(near[:, valid[i]].sum(axis=0) >= 96 // valid[i].sum(), True)
         assert near[:, valid[i]].any(axis=1).all()
-        np.testing.assert_array_equal(bodies.surface_of(scene, jnp.int32(i), 96), points[i])
-    np.testing.assert_allclose(bodies.surfaces(permuted(scene, 0), 96)[:2], points[:2], atol=1e-6)
+        np.testing.assert_array_equal(surface_of(scene, np.int32(i), 96), points[i])
+    np.testing.assert_allclose(np.asarray(surfaces(permuted(scene, 0), 96))[:2], points[:2], atol=1e-6)
 
 
 def test_bodies_fill_slots_as_superquadrics_do():
@@ -216,13 +233,14 @@ def test_bodies_fill_slots_as_superquadrics_do():
 @given(seeds)
 def test_a_superquadric_reaches_as_far_as_its_farthest_point(seed):
     rng = np.random.default_rng(seed)
-    size, e = jnp.float32(rng.uniform(0.02, 0.1, 3)), jnp.float32(rng.uniform(0.2, 1.8, 2))
+    size, e = np.float32(rng.uniform(0.02, 0.1, 3)), np.float32(rng.uniform(0.2, 1.8, 2))
     way = rng.normal(size=3)
-    way = jnp.float32(way / np.linalg.norm(way))
-    farthest = float(jnp.max(superquadric.sample_surface(size, e, 20_000) @ way))
-    assert float(superquadric.support(size, e, way)) == pytest.approx(farthest, rel=0.01)
-    assert float(superquadric.support(size, e, way)) >= farthest * (1 - 1e-5)
-    np.testing.assert_allclose(superquadric.support(size[None], e[None], jnp.eye(3)), size, rtol=1e-6)
+    way = np.float32(way / np.linalg.norm(way))
+    farthest = float(np.max(np.asarray(sample_surface(size, e, 20_000)) @ way))
+    reach = float(support(size, e, way))
+    assert reach == pytest.approx(farthest, rel=0.01)
+    assert reach >= farthest * (1 - 1e-5)
+    np.testing.assert_allclose(support(size[None], e[None], np.eye(3, dtype=np.float32)), size, rtol=1e-6)
 
 
 def test_the_part_between_the_fingers_is_found():

@@ -44,19 +44,19 @@ def test_distances_are_those_of_the_check_of_recognition(objects):
 
 def test_rays_enter_where_the_renderer_sees_the_surface(objects):
     rng = np.random.default_rng(2)
-    origin = jnp.float32([-0.4, 0.1, 1.2])
+    origin, enters = np.float32([-0.4, 0.1, 1.2]), jax.jit(entries, static_argnums=3)
     ends = np.float32([0.6, 0.0, 0.9]) + rng.uniform(-0.15, 0.15, (800, 3)).astype(np.float32)
-    directions = jnp.asarray(ends) - origin[None]
-    enter = np.asarray(entries(objects, origin, directions))
-    seen = np.stack([object_depth(jax.tree.map(lambda a: a[i], objects), origin, directions) for i in range(COUNT)])  # noqa: B023
+    directions = ends - origin
+    enter = np.asarray(enters(objects, origin, directions))
+    seen = np.asarray(jax.jit(jax.vmap(object_depth, (0, None, None)))(objects, origin, directions))
     both = np.isfinite(enter) & np.isfinite(seen)
     assert both.sum() > 300
     # The renderer's edges are a little round.
     assert (np.isfinite(enter) == np.isfinite(seen)).mean() > 0.98
     assert np.quantile(np.abs(enter - seen)[both], 0.95) < 1e-3
     absent = objects.replace(valid=jnp.zeros(COUNT, bool))
-    assert not np.isfinite(entries(absent, origin, directions)).any()
-    smaller = np.isfinite(entries(objects, origin, directions, 0.01))
+    assert not np.isfinite(enters(absent, origin, directions)).any()
+    smaller = np.isfinite(enters(objects, origin, directions, 0.01))
     assert smaller.sum() < np.isfinite(enter).sum()
     assert (np.isfinite(enter) | ~smaller).all()
 

@@ -28,6 +28,8 @@ def assert_same(a, b):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_a_problem_read_from_disk_is_the_one_that_was_built(folder, problem, monkeypatch):
     assert_same(cache.cached_problem(), problem)
     (file,) = folder.iterdir()
