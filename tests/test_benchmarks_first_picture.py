@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from recordings import FOUND, RECORDING, step
+from recordings import EPISODE, FOUND, LOST, RECORDING, step
 
 from mechsearch_jax.benchmarks.site.first_picture import FEWEST, MOST, OUT, POLICIES, SCENE, both, check_search
 from mechsearch_jax.commands.options import find_scenario
@@ -41,11 +41,14 @@ def searched(pushes):
 
 
 def test_a_scene_that_shows_no_search_is_refused():
-    check_search(searched(FEWEST - 1))
-    check_search(searched(MOST - 1))
+    check_search(searched(FEWEST - 1), LOST)
+    check_search(searched(MOST - 1), LOST)
     for recording in (searched(FEWEST - 2), searched(MOST), dataclasses.replace(RECORDING, steps=RECORDING.steps[:2])):
         with pytest.raises(InputError, match=f"{SCENE}: .* choose a scene whose hidden target is taken out"):
-            check_search(recording)
+            check_search(recording, LOST)
+    found = dataclasses.replace(RECORDING, episode=dataclasses.replace(EPISODE, retrieved=True))
+    with pytest.raises(InputError, match="take the target out, too; choose a scene where they do not"):
+        check_search(searched(MOST - 1), found)
 
 
 def test_the_picture_is_there_and_moves():

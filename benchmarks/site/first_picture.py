@@ -26,7 +26,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.viz.movie import save_movie
 
-SCENE = "development-6-002"
+SCENE = "development-6-017"
 OUT = Path("docs/search.webp")
 # The policies, and what is written above each film.
 POLICIES: Mapping[str, str] = {"search-for-grasp": "search-for-grasp", "random": "random actions, the same scene"}
@@ -53,8 +53,10 @@ def recording_of(policy: str, recordings: Path) -> Recording:
     return load_recording(folder / NAME)
 
 
-def check_search(recording: Recording) -> None:
-    """Check that a recording shows a search: the target is hidden at first, and taken out after a few actions.
+def check_search(recording: Recording, other: Recording) -> None:
+    """Check that a recording shows a search: the target is hidden at first and taken out after a few actions.
+
+    In the other recording it must not be taken out.
 
     Raises:
       InputError: it does not.
@@ -65,6 +67,8 @@ def check_search(recording: Recording) -> None:
             f"{SCENE}: {len(kinds)} actions, {recording.heading}; choose a scene whose hidden target is taken out by "
             f"action {FEWEST} to {MOST}"
         )
+    if other.episode is not None and other.episode.retrieved:
+        raise InputError(f"{SCENE}: {POLICIES['random']}, take the target out, too; choose a scene where they do not")
 
 
 class Pictures(Protocol):
@@ -104,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         with tempfile.TemporaryDirectory() as fresh:
             recordings = [recording_of(policy, given.recordings or Path(fresh)) for policy in POLICIES]
-        check_search(recordings[0])
+        check_search(*recordings)
         films = [Film(recording, WIDTH, FPS, SPEED) for recording in recordings]
         save_movie(both(films, list(POLICIES.values())), given.out, FPS)
     except InputError as error:
