@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,7 +113,7 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
 
     def attempt(_, state):
         parts, cost, active = state
-        members, tried = jax.vmap(_trials)(parts, evidence, frames)
+        members, tried = jax.vmap(lambda *row: _trials(*row, config))(parts, evidence, frames)
         tried = _refined(tried, members, active, evidence, scene, QUICK)
         after, found = jax.vmap(lambda *row: _chosen(*row, config))(parts, tried, evidence)
         better = active & (found < cost)
@@ -196,9 +195,11 @@ def _nearest(parts: Superquadrics, evidence: Evidence) -> Bool[Array, "k m"]:
     return (jnp.argmin(off, axis=0)[None] == jnp.arange(PARTS)[:, None]) & (evidence.point_weight > 0)[None]
 
 
-def _trials(parts: Superquadrics, evidence: Evidence, frame: Frame) -> tuple[Bool[Array, "t m"], Superquadrics]:
+def _trials(
+    parts: Superquadrics, evidence: Evidence, frame: Frame, config: PartsConfig
+) -> tuple[Bool[Array, "t m"], Superquadrics]:
     """Subsets of a segment's points, and the shapes that are tried for each."""
-    table = table_of(parts, evidence, PartsConfig())
+    table = table_of(parts, evidence, config)
     near = _nearest(parts, evidence)
     misfit = jnp.min(table.misfit, axis=0)
     bad = jnp.sum(near * (misfit * evidence.point_weight)[None], axis=1)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception import solids
 from mechsearch_jax.perception.scores import EDGE
-from mechsearch_jax.perception.selection import Costs, check_numbers
+from mechsearch_jax.perception.selection import check_numbers
 
 # Objects that are shrunk keep at least this share of their sizes.
 _LEAST = 0.3
@@ -81,7 +81,9 @@ def distance(parts: Superquadrics, points: Float[Array, "p 3"]) -> Float[Array, 
     a, b, c = (parts.size[:, i, None] for i in range(3))
     first = jnp.sqrt((x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2)
     second = jnp.sqrt((x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2)
-    smooth = jnp.where(second > 1e-6, first * (first - 1.0) / jnp.maximum(second, 1e-6), -jnp.minimum(a, jnp.minimum(b, c)))
+    smooth = jnp.where(
+        second > 1e-6, first * (first - 1.0) / jnp.maximum(second, 1e-6), -jnp.minimum(a, jnp.minimum(b, c))
+    )
     return jnp.where((parts.exponents[:, 0] > EDGE)[:, None], smooth, flat)
 
 
@@ -162,7 +164,11 @@ def select_union(
         after = changed(slots)
         slot, candidate = jnp.unravel_index(jnp.argmin(after), after.shape)
         gained = after[slot, candidate] < cost - 1e-3
-        return jnp.where(gained, slots.at[slot].set(candidate), slots), jnp.minimum(after[slot, candidate], cost), gained
+        return (
+            jnp.where(gained, slots.at[slot].set(candidate), slots),
+            jnp.minimum(after[slot, candidate], cost),
+            gained,
+        )
 
     def descend(slots):
         cost = jnp.min(jnp.diagonal(changed(slots)[:, slots]))
