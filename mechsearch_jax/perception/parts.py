@@ -30,7 +30,7 @@ from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Points nearer than this to a part's surface count as its own, whatever else is near [m].
+# How shapes are fitted that are tried, and those that are kept.
 QUICK = RefinementConfig(
     hypotheses=(),
     points=128,
@@ -61,7 +61,7 @@ class PartsConfig(UnionCosts):
     rays: int = 768
     border: float = 0.25
     doubtful: float = 12.0
-    doubtful_share: float = 0.05
+    doubtful_share: float = 0.03
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +103,9 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
     """
     base = fitted.objects
     eye = jnp.array(camera.position)
-    evidence = jax.vmap(lambda slot: evidence_of(image, fitted.labels, slot, camera, config))(jnp.arange(SLOTS))
+    noise = depth_noise(image, fitted.labels)
+    slots = jnp.arange(SLOTS)
+    evidence = jax.vmap(lambda slot: evidence_of(image, fitted.labels, slot, noise, camera, config))(slots)
     frames = jax.vmap(lambda body: frame_of(body, eye, jnp.float32(shelf.board)))(base)
     parts = jax.tree.map(lambda a: jnp.stack([a] * PARTS, axis=1), base)
     parts = parts.replace(valid=parts.valid & (jnp.arange(PARTS) == 0)[None])
@@ -152,10 +154,27 @@ def _spread(count: int) -> np.ndarray:
     return ((0.5 + np.arange(1, count + 1)[:, None] / ratio ** np.arange(1.0, 3.0)) % 1.0).astype(np.float32)
 
 
+def depth_noise(image: LabelledImage, labels: Int[Array, "h w"]) -> Float[Array, ""]:
+    """Standard deviation of the depth's noise on the segments [m], from second differences along rows of the image,
+    which surfaces that are flat or gently bent have none of; 0 without segments."""
+    left, middle, right = (jax.lax.slice_in_dim(image.depth, i, labels.shape[1] - 2 + i, axis=1) for i in range(3))
+    own = [jax.lax.slice_in_dim(labels, i, labels.shape[1] - 2 + i, axis=1) for i in range(3)]
+    inside = (own[0] == own[1]) & (own[1] == own[2]) & (own[1] >= 0)
+    bend = jnp.abs(left - 2.0 * middle + right)
+    # The median of absolute values is 0.6745 standard deviations; the variances of the three pixels add up to six.
+    usual = jnp.nanmedian(jnp.where(inside & jnp.isfinite(bend), bend, jnp.nan)) / (0.6745 * 6.0**0.5)
+    return jnp.nan_to_num(usual)
+
+
 def evidence_of(
-    image: LabelledImage, labels: Int[Array, "h w"], slot: Int[Array, ""], camera: Camera, config: PartsConfig
+    image: LabelledImage,
+    labels: Int[Array, "h w"],
+    slot: Int[Array, ""],
+    noise: Float[Array, ""],
+    camera: Camera,
+    config: PartsConfig,
 ) -> Evidence:
-    """What the segment of a slot is judged by."""
+    """What the segment of a slot is judged by; `noise` is of the depth [m]."""
     member = labels == slot
     height, width = labels.shape
     index, weight = select(labels.reshape(-1), slot, config.points)
@@ -182,6 +201,7 @@ def evidence_of(
         free=jnp.where(jnp.isnan(seen), 0.0, jnp.minimum(seen, FAR)),
         ray_weight=(bottom - top + 1.0) * (right - left + 1.0) / config.rays,
         pixels=pixels,
+        exact=jnp.maximum(config.exact, config.deviations * noise),
     )
 
 

@@ -16,6 +16,8 @@ from mechsearch_jax.perception.selection import check_numbers
 
 # Objects that are shrunk keep at least this share of their sizes.
 _LEAST = 0.3
+# A change must gain more than rounding does [pixels].
+LEAST_GAIN = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,18 +25,20 @@ class UnionCosts:
     """What an explanation of a segment by parts costs; lengths in metres, costs in view pixels.
 
     Attributes:
-      exact: a point this near to a part's surface is explained.
+      exact: a point this near to a part's surface is explained, or one that is so many times as near as ...
+      deviations: ... the standard deviation of the depth's noise.
       wrong: a point that is farther by this is not; between the two its cost grows evenly.
       shrink: rays may pass this deep below a part's faces.
       part: price of each part after the first, and ...
       part_share: ... this share of the segment's pixels.
     """
 
-    exact: float = 0.003
-    wrong: float = 0.005
-    shrink: float = 0.003
+    exact: float = 0.002
+    deviations: float = 2.5
+    wrong: float = 0.004
+    shrink: float = 0.002
     part: float = 6.0
-    part_share: float = 0.01
+    part_share: float = 0.005
 
     def __post_init__(self):
         check_numbers(self, positive=("wrong",))
@@ -51,6 +55,7 @@ class Evidence(flax.struct.PyTreeNode):
       free: length up to which each ray is free, in lengths of its direction; 0 if nothing was measured, shape (R,).
       ray_weight: pixels for each ray, shape ().
       pixels: of the segment, shape ().
+      exact: a point this near to a surface is explained [m], shape ().
     """
 
     points: jax.Array
@@ -60,6 +65,7 @@ class Evidence(flax.struct.PyTreeNode):
     free: jax.Array
     ray_weight: jax.Array
     pixels: jax.Array
+    exact: jax.Array
 
 
 class Table(flax.struct.PyTreeNode):
@@ -106,11 +112,13 @@ def entries(
 
 def table_of(parts: Superquadrics, evidence: Evidence, costs: UnionCosts) -> Table:
     """What candidates explain; those that are not valid explain nothing."""
-    off = jnp.clip((jnp.abs(distance(parts, evidence.points)) - costs.exact) / costs.wrong, 0.0, 1.0)
+    off = jnp.clip((jnp.abs(distance(parts, evidence.points)) - evidence.exact) / costs.wrong, 0.0, 1.0)
     enter = entries(parts, evidence.origin, evidence.directions, costs.shrink)
+    # Rays end where they are measured, with the noise of points.
+    until = evidence.free[None] - costs.shrink - (evidence.exact - costs.exact)
     return Table(
         misfit=jnp.where(parts.valid[:, None], off, 1.0),
-        through=(enter < evidence.free[None] - costs.shrink) & parts.valid[:, None],
+        through=(enter < until) & parts.valid[:, None],
     )
 
 
@@ -163,7 +171,7 @@ def select_union(
         slots, cost, _ = state
         after = changed(slots)
         slot, candidate = jnp.unravel_index(jnp.argmin(after), after.shape)
-        gained = after[slot, candidate] < cost - 1e-3
+        gained = after[slot, candidate] < cost - LEAST_GAIN
         return (
             jnp.where(gained, slots.at[slot].set(candidate), slots),
             jnp.minimum(after[slot, candidate], cost),
