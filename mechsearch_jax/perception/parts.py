@@ -10,6 +10,8 @@ is fitted again to the points that are nearest to it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -115,9 +117,9 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
 
     def attempt(_, state):
         parts, cost, active = state
-        members, tried = jax.vmap(lambda *row: _trials(*row, config))(parts, evidence, frames)
+        members, tried = _each(_trials, config, active, parts, evidence, frames)
         tried = _refined(tried, members, active, evidence, scene, QUICK)
-        after, found = jax.vmap(lambda *row: _chosen(*row, config))(parts, tried, evidence)
+        after, found = _each(_chosen, config, active, parts, tried, evidence)
         better = active & (found < cost)
         return _where(better, after, parts), jnp.where(better, found, cost), better
 
@@ -126,10 +128,19 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
     for _ in range(2):
         members = jax.vmap(_nearest)(parts, evidence)
         again = _refined(parts, members, several, evidence, scene, FINE)
-        after, found = jax.vmap(lambda *row: _chosen(*row, config))(parts, again, evidence)
+        after, found = _each(_chosen, config, several, parts, again, evidence)
         better = several & (found < cost)
         parts, cost = _where(better, after, parts), jnp.where(better, found, cost)
     return _bodies(base, parts, frames)
+
+
+def _each(function: Callable[..., Any], config: PartsConfig, active: Bool[Array, " n"], *rows: Any) -> Any:
+    """A function of a segment's rows and the costs, for each segment that is active; zeros for the others."""
+
+    def run(_, element, row):
+        return function(*row, config)
+
+    return masked_vmap(run, active, None, None, rows, block=1 if on_cpu() else SLOTS)
 
 
 def _where(mask: Bool[Array, " n"], a: Superquadrics, b: Superquadrics) -> Superquadrics:
