@@ -31,7 +31,7 @@ from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View
 from mechsearch_jax.perception.explanation import Fitter, as_segmented
-from mechsearch_jax.perception.parts import InParts
+from mechsearch_jax.perception.parts.in_parts import InParts
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.problem.workcell import Workcell

@@ -4,7 +4,7 @@
 - `oracle` returns the true shapes and poses.
 - `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
 - `full` receives a noisy depth and a noisy colour image alone and segments them.
-- `masks-parts` and `full-parts` are these two with bodies of up to four parts, see `perception.parts`.
+- `masks-parts` and `full-parts` are these two with bodies of up to four parts, see `perception.parts.in_parts`.
 
 `masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. `oracle` and `masks` know whether
 the target shows more than 100 pixels, and `masks` then which; only the oracle gets the target's pose. `full` finds the
@@ -35,7 +35,7 @@ from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, m
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.explanation import Explaining, Fitter, as_segmented
-from mechsearch_jax.perception.parts import InParts
+from mechsearch_jax.perception.parts.in_parts import InParts
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter

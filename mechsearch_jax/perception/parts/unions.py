@@ -124,10 +124,15 @@ def table_of(parts: Superquadrics, evidence: Evidence, costs: UnionCosts) -> Tab
 
 def union_cost(table: Table, chosen: Bool[Array, " c"], evidence: Evidence, costs: UnionCosts) -> Float[Array, ""]:
     """What the union of the chosen candidates costs, which must be at least one [pixels]."""
+    price = (jnp.sum(chosen) - 1) * (costs.part + costs.part_share * evidence.pixels)
+    return union_misfit(table, chosen, evidence) + price
+
+
+def union_misfit(table: Table, chosen: Bool[Array, " c"], evidence: Evidence) -> Float[Array, ""]:
+    """How many pixels the union of the chosen candidates explains badly, or are of rays that pass through it."""
     left = jnp.min(jnp.where(chosen[:, None], table.misfit, 1.0), axis=0)
     through = jnp.any(table.through & chosen[:, None], axis=0)
-    price = (jnp.sum(chosen) - 1) * (costs.part + costs.part_share * evidence.pixels)
-    return jnp.sum(left * evidence.point_weight) + jnp.sum(through) * evidence.ray_weight + price
+    return jnp.sum(left * evidence.point_weight) + jnp.sum(through) * evidence.ray_weight
 
 
 def select_union(

@@ -21,12 +21,22 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mechsearch_jax.geometry.bodies import PARTS, bodies_of, with_parts
 from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
-from mechsearch_jax.perception.divisions import Frame, frame_of, guesses, halves, in_frame
+from mechsearch_jax.perception.confidence import confidence_of
 from mechsearch_jax.perception.explanation import Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.hypotheses import SLOTS
+from mechsearch_jax.perception.parts.divisions import Frame, frame_of, guesses, halves, in_frame
+from mechsearch_jax.perception.parts.unions import (
+    Evidence,
+    UnionCosts,
+    distance,
+    select_union,
+    table_of,
+    union_cost,
+    union_misfit,
+)
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import FAR, RefinementConfig, refine, select
-from mechsearch_jax.perception.unions import Evidence, UnionCosts, distance, select_union, table_of, union_cost
+from mechsearch_jax.perception.selection import check_numbers
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.shelf import Shelf
@@ -51,6 +61,7 @@ class PartsConfig(UnionCosts):
 
     Attributes:
       rounds: how often other parts are tried.
+      refits: how often every part is fitted again at last.
       points: largest number of a segment's points that are used.
       rays: number of pixels in and around a segment's image whose rays are used.
       border: how far those reach beyond the segment's bounding box, as a share of its sides.
@@ -59,11 +70,15 @@ class PartsConfig(UnionCosts):
     """
 
     rounds: int = 3
+    refits: int = 2
     points: int = 512
     rays: int = 768
     border: float = 0.25
     doubtful: float = 12.0
     doubtful_share: float = 0.03
+
+    def __post_init__(self):
+        check_numbers(self, positive=("wrong", "points", "rays"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,12 +105,14 @@ class InParts:
         least: float = 0.0,
     ) -> Fitted:
         fitted = self.of(keys, image, shapes, camera, shelf, target, refinement, least)
-        return fitted.replace(objects=in_parts(image, fitted, camera, shelf, self.config))
+        return in_parts(image, fitted, camera, shelf, self.config)
 
 
 @kept(static_argnames=("config",))
-def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf, config: PartsConfig) -> Superquadrics:
-    """The objects of `fitted` as bodies of parts, in the same slots.
+def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf, config: PartsConfig) -> Fitted:
+    """What was made of an image, with its objects as bodies of parts in the same slots.
+
+    The confidence in a body of several parts is that of an object with the misfit of all parts together.
 
     Args:
       image: of the camera.
@@ -125,13 +142,17 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
 
     parts, cost, _ = jax.lax.fori_loop(0, config.rounds, attempt, (parts, cost, doubtful))
     several = jnp.sum(parts.valid, axis=1) > 1
-    for _ in range(2):
+    for _ in range(config.refits):
         members = jax.vmap(_nearest)(parts, evidence)
         again = _refined(parts, members, several, evidence, scene, FINE)
         after, found = _each(_chosen, config, several, parts, again, evidence)
         better = several & (found < cost)
         parts, cost = _where(better, after, parts), jnp.where(better, found, cost)
-    return _bodies(base, parts, frames)
+    misfit = jax.vmap(lambda p, e: union_misfit(table_of(p, e, config), p.valid, e))(parts, evidence)
+    misfit = misfit / jnp.maximum(evidence.pixels, 1.0)
+    measures = fitted.measures.replace(misfit=jnp.where(several, misfit, fitted.measures.misfit))
+    confidence = jnp.where(several, confidence_of(measures), fitted.confidence)
+    return fitted.replace(objects=_bodies(base, parts, frames), measures=measures, confidence=confidence)
 
 
 def _each(function: Callable[..., Any], config: PartsConfig, active: Bool[Array, " n"], *rows: Any) -> Any:
