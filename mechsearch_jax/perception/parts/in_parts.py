@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import PARTS, bodies_of, with_parts
 from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
@@ -42,6 +43,8 @@ from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
+# How far a shape may reach into the shelf's faces [m].
+INTO_WALLS = 0.005
 # How shapes are fitted that are tried, and those that are kept.
 QUICK = RefinementConfig(
     hypotheses=(),
@@ -305,7 +308,16 @@ def _refined(
     fits = masked_vmap(fit, used.reshape(-1), (camera, shelf), (depth, evidence.points), rows, block=block)
     fits = fits.replace(size=jnp.where(used.reshape(-1, 1), fits.size, 0.01))
     fits = jax.tree.map(lambda a: a.reshape(SLOTS, count, *a.shape[1:]), fits)
-    return fits.replace(valid=used & fits.valid)
+    return fits.replace(valid=used & fits.valid & _fits_in(fits, shelf))
+
+
+def _fits_in(parts: Superquadrics, shelf: Shelf) -> Bool[Array, "*batch"]:
+    """Which shapes reach into the board, the back or a side by less than `INTO_WALLS`: no ray says that they do not."""
+    # The rows of the rotation are the world's axes in the shape's frame.
+    reach = superquadric.support(parts.size[..., None, :], parts.exponents[..., None, :], parts.rotation)
+    low, high = parts.position - reach + INTO_WALLS, parts.position + reach - INTO_WALLS
+    stands = (low[..., 2] >= shelf.board) & (high[..., 0] <= shelf.back)
+    return stands & (low[..., 1] >= shelf.right) & (high[..., 1] <= shelf.left)
 
 
 def _chosen(
