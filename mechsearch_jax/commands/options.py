@@ -40,8 +40,7 @@ class EpisodeOptions:
       config_file: a file of settings of camera, shelf, gripper, target, objects and planner; what else is given here
         goes before it. `mechsearch config` prints an example.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses, "informed" the
-        hidden target's too; the others see a noisy depth image, "masks" with the true segmentation, "full" without;
-        "-parts" makes of each segment a body of up to four superquadrics.
+        target's too; the others see noisy depth, "masks" with true segments; "-parts": bodies of up to four parts.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
       protocol: how episodes are run and judged: strictly, or as the authors' published code does.
