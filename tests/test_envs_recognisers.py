@@ -251,7 +251,7 @@ def test_names_stand_for_one_object_each(masks):
     assert recogniser("masks", target) is masks
     assert recogniser("oracle", target) is oracle
     assert recogniser("informed", target) is informed
-    with pytest.raises(InputError, match="unknown; use oracle, masks, full, informed"):
+    with pytest.raises(InputError, match="unknown; use oracle, masks, masks-parts, full, full-parts, informed"):
         recogniser("eyes", target)
 
 

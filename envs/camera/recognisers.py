@@ -4,6 +4,7 @@
 - `oracle` returns the true shapes and poses.
 - `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
 - `full` receives a noisy depth and a noisy colour image alone and segments them.
+- `masks-parts` and `full-parts` are these two with bodies of up to four parts, see `perception.parts.in_parts`.
 
 `masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. `oracle` and `masks` know whether
 the target shows more than 100 pixels, and `masks` then which; only the oracle gets the target's pose. `full` finds the
@@ -34,6 +35,7 @@ from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, m
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.explanation import Explaining, Fitter, as_segmented
+from mechsearch_jax.perception.parts.in_parts import InParts
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
@@ -43,7 +45,7 @@ from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-RecognitionName = Literal["oracle", "masks", "full", "informed"]
+RecognitionName = Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"]
 # The recognisers that see no image.
 _TRUE: Mapping[str, Recogniser] = {"oracle": oracle, "informed": informed}
 
@@ -81,19 +83,21 @@ class ImageRecogniser:
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
+      fitter: fits objects to the true segments.
     """
 
     target: Target
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
+    fitter: Fitter = as_segmented
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
         image = labelled(keys[0], self, view, shelf, snapshot.world, snapshot.target_seen, snapshot.sensing)
         shapes = ShapeNetwork.of(self.weights)
-        fitted = as_segmented(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
+        fitted = self.fitter(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
         return Observation(fitted.objects, snapshot.target_seen, fitted.target_pose, fitted.confidence)
 
 
@@ -257,15 +261,19 @@ def recogniser(name: str, target: Target, detector: TargetColour | None = None) 
         raise InputError(f'recognition "{name}" is unknown; use {", ".join(get_args(RecognitionName))}')
     if name in _TRUE:
         return _TRUE[name]
-    return _with_masks(target) if name == "masks" else _alone(target, detector or TargetColour.lit())
+    seen, _, parts = name.partition("-")
+    several = bool(parts)
+    return _with_masks(target, several) if seen == "masks" else _alone(target, detector or TargetColour.lit(), several)
 
 
 @functools.cache
-def _with_masks(target: Target) -> ImageRecogniser:
-    return ImageRecogniser(target, shipped_weights("recognition"))
+def _with_masks(target: Target, several: bool) -> ImageRecogniser:
+    fitter = InParts() if several else as_segmented
+    return ImageRecogniser(target, shipped_weights("recognition"), fitter=fitter)
 
 
 @functools.cache
-def _alone(target: Target, detector: TargetColour) -> ColourRecogniser:
+def _alone(target: Target, detector: TargetColour, several: bool) -> ColourRecogniser:
     segmenter = WeightedSegmenter(shipped_weights("segmentation"))
-    return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"))
+    fitter = InParts(Explaining()) if several else Explaining()
+    return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"), fitter=fitter)

@@ -31,7 +31,7 @@ RESULTS = {
 # What stands for what nobody knows.
 UNKNOWN = "–"
 # Recognisers that see images, and may be wrong.
-SEEING = ("masks", "full")
+SEEING = ("masks", "masks-parts", "full", "full-parts")
 # An object that shows no more pixels than this counts as hidden.
 FEWEST_PIXELS = 100
 # A body that is recognised farther than this from where it is counts as wrong [m].

@@ -148,7 +148,7 @@ class Mismatch:
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
             raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
-        if recognition != "full" and self.colours_otherwise:
+        if recognition not in ("full", "full-parts") and self.colours_otherwise:
             raise InputError(
                 "--color-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
             )

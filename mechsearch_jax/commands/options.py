@@ -40,14 +40,14 @@ class EpisodeOptions:
       config_file: a file of settings of camera, shelf, gripper, target, objects and planner; what else is given here
         goes before it. `mechsearch config` prints an example.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses, "informed" the
-        hidden target's too; the others see a noisy depth image, "masks" with the true segmentation, "full" without.
+        target's too; the others see noisy depth, "masks" with true segments; "-parts": bodies of up to four parts.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
       protocol: how episodes are run and judged: strictly, or as the authors' published code does.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
-    recognition: Literal["oracle", "masks", "full", "informed"] = "oracle"
+    recognition: Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
     protocol: Literal["strict", "published-code"] = "strict"
 

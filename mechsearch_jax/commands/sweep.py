@@ -24,7 +24,7 @@ from mechsearch_jax.runtime.errors import InputError, nearest
 if TYPE_CHECKING:
     from mechsearch_jax.planner import Option
 
-Recognition = Literal["oracle", "masks", "full", "informed"]
+Recognition = Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"]
 ProtocolName = Literal["strict", "published-code"]
 SimulatorName = Literal["auto", "native", "mjx"]
 # Types of the keys of a sweep's file that are no options of the planner; all but the last two may be lists.

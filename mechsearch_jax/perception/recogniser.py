@@ -75,6 +75,7 @@ class Recogniser:
       detector: finds the target's pixels in a colour image.
       refinement: how the network's shapes are fitted to the depth image.
       fitter: fits objects to the segments of images without a mask.
+      mask_fitter: fits objects to the segments of a mask.
     """
 
     camera: Camera
@@ -86,6 +87,7 @@ class Recogniser:
     detector: TargetDetector
     refinement: RefinementConfig
     fitter: Fitter
+    mask_fitter: Fitter
 
     def __init__(
         self,
@@ -97,6 +99,7 @@ class Recogniser:
         detector: TargetDetector | None = None,
         refinement: RefinementConfig | None = None,
         fitter: Fitter | None = None,
+        mask_fitter: Fitter | None = None,
     ):
         """Set up recognition for a problem.
 
@@ -108,7 +111,9 @@ class Recogniser:
           detector: by default for a red target in any light, `TargetColour.lit()`.
           refinement: the default if None.
           fitter: by default `Explaining()`, which splits, joins and drops segments where that explains the image
-            better; `as_segmented` keeps the segmenter's. Segments of a mask are always kept.
+            better; `as_segmented` keeps the segmenter's. With `parts.in_parts.InParts(Explaining())` objects are
+            bodies of up to four parts.
+          mask_fitter: by default `as_segmented`, which keeps the mask's segments, as `parts.in_parts.InParts()` does.
 
         Raises:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
@@ -125,6 +130,7 @@ class Recogniser:
             "detector": _as_pytree(detector or TargetColour.lit()),
             "refinement": refinement or RefinementConfig(),
             "fitter": fitter or Explaining(),
+            "mask_fitter": mask_fitter or as_segmented,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -139,12 +145,13 @@ class Recogniser:
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         data = (self.segmenter, self.shapes, self.detector, self.camera, self.view, self.shelf)
-        return data, (self.target, self.refinement, self.fitter)
+        return data, (self.target, self.refinement, self.fitter, self.mask_fitter)
 
     @classmethod
     def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
         made = object.__new__(cls)
-        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf", "target", "refinement", "fitter")
+        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf")
+        names = (*names, "target", "refinement", "fitter", "mask_fitter")
         for name, value in zip(names, (*leaves, *static), strict=True):
             object.__setattr__(made, name, value)
         return made
@@ -198,7 +205,7 @@ class Recogniser:
         check_images(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
-        fitter = self.fitter if mask is None else as_segmented
+        fitter = self.fitter if mask is None else self.mask_fitter
         settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
         unseen = found_pixels(self.camera) / self.view.stride**2
         return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible

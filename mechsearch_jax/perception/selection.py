@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import flax.struct
 import jax
@@ -60,11 +61,11 @@ class Costs:
         check_numbers(self, positive=("points", "rays", "wrong"))
 
 
-def check_numbers(config: Costs, positive: tuple[str, ...]) -> None:
+def check_numbers(config: Any, positive: tuple[str, ...]) -> None:
     """Check that all numbers of a configuration are finite and at least 0, and some of them more.
 
     Args:
-      config: what is checked.
+      config: what is checked, a dataclass.
       positive: names of those that must be more than 0.
 
     Raises:

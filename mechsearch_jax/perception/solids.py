@@ -29,14 +29,15 @@ def local(objects: Superquadrics, vectors: Float[Array, "p 3"]) -> tuple[Array, 
     return first, second, third
 
 
-def _relative(objects: Superquadrics, points: Float[Array, "p 3"]) -> list[Array]:
+def relative(objects: Superquadrics, points: Float[Array, "p 3"]) -> list[Array]:
+    """The coordinates of world points in every object's frame [m], each of the shape (N, P)."""
     centre = jnp.einsum("nki,nk->ni", objects.rotation, objects.position, precision="highest")
     return [part - centre[:, i, None] for i, part in enumerate(local(objects, points))]
 
 
 def surface_distance(objects: Superquadrics, points: Float[Array, "p 3"]) -> Float[Array, "n p"]:
     """Approximate signed distance of world points from every object's surface [m], negative inside."""
-    x, y, z = _relative(objects, points)
+    x, y, z = relative(objects, points)
     a, b, c = (objects.size[:, i, None] for i in range(3))
     across = (jnp.sqrt((x / a) ** 2 + (y / b) ** 2) - 1.0) * jnp.minimum(a, b)
     is_round = (objects.exponents[:, 1] > EDGE)[:, None]
@@ -62,7 +63,7 @@ def entries(
       shrink: by how much the objects' half-extents are reduced [m].
     """
     size = jnp.maximum(objects.size - shrink, _LEAST * objects.size)
-    start = [part for part in _relative(objects, origin[None])]
+    start = [part for part in relative(objects, origin[None])]
     way = [jnp.where(jnp.abs(part) < 1e-9, 1e-9, part) for part in local(objects, directions)]
     ends = [
         jnp.stack([(-size[:, i, None] - start[i]) / way[i], (size[:, i, None] - start[i]) / way[i]]) for i in range(3)

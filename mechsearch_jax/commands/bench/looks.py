@@ -1,4 +1,4 @@
-"""`mechsearch bench looks`: what comes of depth and colour images alone, end to end."""
+"""`mechsearch bench looks` and `bodies`: what comes of images, end to end."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mechsearch_jax.runtime.errors import InputError
 
 Noise = Literal["clean", "gaussian", "time-of-flight"]
 Segments = Literal["network", "explained", "joined", "true"]
+Description = Literal["one", "parts", "true parts"]
 
 
 def bench_looks(
@@ -71,4 +72,48 @@ def bench_looks(
     console.print(looks_tables(measured))
 
 
-COMMANDS = {"looks": bench_looks}
+def bench_bodies(
+    scenarios: Scenarios,
+    /,
+    *,
+    described_by: tuple[Description, ...] = ("one", "parts", "true parts"),
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Measure how well recognised bodies describe the true ones: the volume in common, and whether the gripper at
+    random poses near an object is rightly said to hit it. The images are those of `--recognition masks`.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      described_by: each object by one superquadric, by up to four, or by those that its true shape is known by.
+      seed: of noise, recognition and poses.
+      out: JSON file for the figures, with every object.
+
+    Raises:
+      InputError: two scenarios have the same name, or the file cannot be written.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.looks import bodies
+    from mechsearch_jax.benchmarks.report.bodies_tables import bodies_tables
+    from mechsearch_jax.runtime.files import save_json
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    check_files(out)
+    scenes = {}
+    for file in find_scenarios(scenarios):
+        scenario = load_scenario(file)
+        if scenario.name in scenes:
+            raise InputError(f"bench bodies: {file}: another scenario is named {scenario.name!r}, too; rename it")
+        scenes[scenario.name] = scenario
+    console = Console(highlight=False)
+    with console.status("compiling") as status:
+        bench = bodies.Bench(scenes, tuple(dict.fromkeys(described_by)), seed)
+        forget_kept_compilations()
+        measured = bench.run(lambda done: status.update(f"looking {done}/{len(scenes)}"))
+        if out is not None:
+            save_json(measured.value(), out)
+    console.print(bodies_tables(measured))
+
+
+COMMANDS = {"looks": bench_looks, "bodies": bench_bodies}

@@ -1,0 +1,1 @@
+"""Segments explained by bodies of several superquadrics."""
