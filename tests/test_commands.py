@@ -366,7 +366,7 @@ def test_help_names_options_with_their_defaults(capsys):
     assert "--gamma FLOAT" in shown
     assert "(default: 0.7, in preset paper and published-code 0.0)" in shown
     assert "(default: 1, in preset paper and published-code 8, in preset best 4)" in shown
-    assert "(default: 30)" in shown
+    assert "(default: 100, in preset paper and published-code 30)" in shown
     assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
 
