@@ -37,7 +37,7 @@ PUSH = jax.tree.map(
 )
 RETRIEVAL = jax.tree.map(np.asarray, retrieve_action(GRIPPER, jnp.float32(0.7), jnp.float32(0.08)))
 # Two sequences of two actions, and one that found nothing to do.
-FAR = PUSH.replace(displacement=2 * PUSH.displacement)
+FAR = PUSH.replace(displacement=2 * PUSH.displacement, T_world_place=np.asarray(GRIPPER.at[1, 3].add(0.2)))
 
 
 def shifted(*shifts):

@@ -90,7 +90,7 @@ def test_what_is_data_compiles_nothing_anew(folder):
     ],
 )
 def test_other_arguments_are_other_entries(folder, arguments):
-    calls = [(Camera(), VALUES), (Camera(), VALUES, 2.5, PlannerConfig(horizon=1)), (Camera(), VALUES, jnp.ones(3))]
+    calls = [(Camera(), VALUES), (Camera(), VALUES, 2.5, PlannerConfig(horizon=3)), (Camera(), VALUES, jnp.ones(3))]
     for call in calls:
         another_process()(*call)
     again = another_process()

@@ -20,7 +20,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.workspace import scenario
 
-POLICY = planner.search_for_grasp()
+POLICY = planner.search_for_grasp(move_target=True)
 POSE = (0.469, -0.058, 0.0)
 # How far the target is pushed, in predicted states [m].
 PUSH = np.float32([0.0, 0.05, 0.0])

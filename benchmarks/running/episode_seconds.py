@@ -25,7 +25,7 @@ from mechsearch_jax.runtime.files import PathLike, replacing
 
 FILE = Path(__file__).with_name("episode_seconds.json")
 # The run before rows were stored: on one H100 with 16 cores, in batches.
-EARLIER = "standard-h100.json"
+EARLIER, EARLIER_PRESET = "standard-h100.json", "standard until 2026-11-26"
 H100 = "gpu: NVIDIA H100 80GB HBM3"
 
 
@@ -175,7 +175,7 @@ def earlier(folder: PathLike) -> StoredSeconds:
     compiling = clock["all compiled [s]"] - clock["first line [s]"]
     return StoredSeconds(
         H100,
-        Kind("standard", "oracle", True, "MjxSimulator"),
+        Kind(EARLIER_PRESET, "oracle", True, "MjxSimulator"),
         Measured(episode, compiling, len(run["episodes"])),
         f"benchmarks/results/{EARLIER}",
     )
