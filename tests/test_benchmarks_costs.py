@@ -7,8 +7,9 @@ import pytest
 
 from mechsearch_jax.benchmarks.report.results_page import Stored
 from mechsearch_jax.benchmarks.running import estimate
-from mechsearch_jax.benchmarks.running.episode_seconds import EARLIER_PRESET, H100, Kind
+from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind
 from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD
 from mechsearch_jax.benchmarks.studies import costs_page
 from mechsearch_jax.benchmarks.studies.declared import STUDIES
 from mechsearch_jax.envs.episode.method import Method
@@ -58,7 +59,7 @@ def test_costs_are_those_of_what_was_measured(measures, experiments):
     assert measures.episode(Method(engine=costs_page.ENGINE)) == pytest.approx((209.3 - 108.0) / 720, abs=1e-3)
     (again,) = (part for name, part in experiments.items() if "more seeds" in name)
     seconds = {each.kind: each.seconds.episode_seconds for each in measures.on_gpu}
-    with_masks = seconds[Kind(EARLIER_PRESET, "masks", True, "MjxSimulator")]
+    with_masks = seconds[Kind(THREE_AHEAD, "masks", True, "MjxSimulator")]
     assert measures.running(again) == pytest.approx(again.count * with_masks / 3600)
 
 

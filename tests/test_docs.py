@@ -15,6 +15,7 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, 
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
 from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD
 from mechsearch_jax.benchmarks.store import runs
 from mechsearch_jax.benchmarks.store.runs import load_run
 from mechsearch_jax.benchmarks.studies import page as studies_page
@@ -338,7 +339,7 @@ def test_what_comes_of_images_stands_beside_the_papers_figures():
     stated = {row[0]: row[1:] for row in rows("README.md", header)}
     assert list(stated) == ["2", "4", "6", "8"]
     for line in run.lines:
-        assert line["preset"] == results_page.FORMER
+        assert line["preset"] == THREE_AHEAD
         assert line["settings"] == {"recognition": "masks", CONTACT: False}
         new = line["on_scenes_not_chosen_on"]
         assert new["episodes"] == 360

@@ -17,7 +17,7 @@ from typing import Any
 from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, THREE_AHEAD
 from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.episode.method import Method
@@ -29,8 +29,6 @@ COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default, and of the former one with collision-free grasps alone. Fields of the page are named after them.
 RUNS = ("table1-h200", "first-actions-h200", "collision-free-h100")
-# The default that some figures are still of.
-FORMER = "standard until 2026-11-26"
 # Episodes from images on scenes of which true shapes have as many.
 FULL = "`full`, `report-c`, `report-d`"
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
@@ -180,7 +178,7 @@ def default_rates(table1: StoredRun, first_actions: StoredRun, collision_free: S
     """The fields of the template about what the default reaches, with true shapes and from images."""
     usual = Method()
     masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
-    former = usual.config.with_options(**FORMER_STANDARDS[FORMER], retrieval_contact=False)
+    former = usual.config.with_options(**FORMER_STANDARDS[THREE_AHEAD], retrieval_contact=False)
     grasps = dataclasses.replace(masks, config=former)
     default = {
         "`c2` 090 to 179": _on_new_scenes([table1], usual),
@@ -188,7 +186,7 @@ def default_rates(table1: StoredRun, first_actions: StoredRun, collision_free: S
     }
     images = {
         "`masks`, `c2`, 4 seeds": _on_new_scenes([table1], masks),
-        f"`masks`, `c2`, 4 seeds, collision-free grasps only, {FORMER}": _on_new_scenes([collision_free], grasps),
+        f"`masks`, `c2`, 4 seeds, collision-free grasps only, {THREE_AHEAD}": _on_new_scenes([collision_free], grasps),
         "`full`, `c2`": _on_new_scenes([table1], full),
         FULL: _on_new_scenes([first_actions], full),
     }

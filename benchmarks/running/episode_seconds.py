@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechsearch_jax.benchmarks.statistics.settings import settings_of
+from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD, settings_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.episode.method import Method
@@ -25,7 +25,7 @@ from mechsearch_jax.runtime.files import PathLike, replacing
 
 FILE = Path(__file__).with_name("episode_seconds.json")
 # The run before rows were stored: on one H100 with 16 cores, in batches.
-EARLIER, EARLIER_PRESET = "standard-h100.json", "standard until 2026-11-26"
+EARLIER = "standard-h100.json"
 H100 = "gpu: NVIDIA H100 80GB HBM3"
 
 
@@ -175,7 +175,7 @@ def earlier(folder: PathLike) -> StoredSeconds:
     compiling = clock["all compiled [s]"] - clock["first line [s]"]
     return StoredSeconds(
         H100,
-        Kind(EARLIER_PRESET, "oracle", True, "MjxSimulator"),
+        Kind(THREE_AHEAD, "oracle", True, "MjxSimulator"),
         Measured(episode, compiling, len(run["episodes"])),
         f"benchmarks/results/{EARLIER}",
     )

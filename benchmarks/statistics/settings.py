@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
+# The default before it looked one action ahead.
+THREE_AHEAD = "standard until 2026-11-26"
 # What preset `standard` was before: by the name that it has since, the options that were other than today's.
 FORMER_STANDARDS: Mapping[str, Mapping[str, Any]] = {
-    "standard until 2026-11-26": {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001},
+    THREE_AHEAD: {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001},
 }
 # Options that no preset decides.
 _NOT_OF_PRESETS = frozenset(("simulator", "target", "seed"))

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, THREE_AHEAD
 from mechsearch_jax.benchmarks.studies.robustness import IMAGE_SCENES, REPORT_SCENES, ROBUSTNESS
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 from mechsearch_jax.envs.world.mismatch import Mismatch
@@ -268,18 +268,15 @@ def _around(former: str, studies: Sequence[Study]) -> tuple[Study, ...]:
     return tuple(dataclasses.replace(s, variants=tuple(map(own, s.variants)), around=former) for s in studies)
 
 
-_FORMER = "standard until 2026-11-26"
-
-
 def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
     return {study.name: study for group in groups for study in group}
 
 
 # By what they are for, in the order of the page.
 GROUPS: Mapping[str, Sequence[Study]] = {
-    "Ablations": _around(_FORMER, _ABLATIONS),
-    "On new scenes": (*_around(_FORMER, _CONFIRMATIONS), *_DEFAULT),
-    "Baselines": _around(_FORMER, _BASELINES),
-    "Robustness": _around(_FORMER, ROBUSTNESS),
+    "Ablations": _around(THREE_AHEAD, _ABLATIONS),
+    "On new scenes": (*_around(THREE_AHEAD, _CONFIRMATIONS), *_DEFAULT),
+    "Baselines": _around(THREE_AHEAD, _BASELINES),
+    "Robustness": _around(THREE_AHEAD, ROBUSTNESS),
 }
 STUDIES: Mapping[str, Study] = _by_name(*GROUPS.values())

@@ -20,16 +20,13 @@ def _in_worlds(worlds: Mapping[str, Mismatch], engine: EngineName | None = None,
     return tuple(Variant(label, {**options, "mismatch": world}, engine=engine) for label, world in worlds.items())
 
 
-def _factors(label: str, world: Callable[[float], Mismatch], **options: Any) -> tuple[Variant, ...]:
-    """A variant for each factor on a property of the world, 1 first."""
-    return tuple(
-        Variant(
-            f"{label} x {factor:g}",
-            {**options, "mismatch": world(factor)},
-            value=factor,
-        )
+def _by_factor(name: str, question: str, axis: str, world: Callable[[float], Mismatch], **options: Any) -> Study:
+    """What if a property of the world, the first word of the study's name, is a multiple of what it is taken to be."""
+    variants = tuple(
+        Variant(f"{name.partition('-')[0]} x {factor:g}", {**options, "mismatch": world(factor)}, value=factor)
         for factor in (1.0, 0.5, 0.7, 1.4, 2.0)
     )
+    return Study(name, question, REPORT_SCENES, variants, axis=axis, logarithmic=True)
 
 
 _USUAL_WORLD = {"as assumed": Mismatch()}
@@ -72,29 +69,24 @@ def _shelf(name: str, question: str) -> Study:
 _EACH_DRAWN = Mismatch(friction_spread=2.0, mass_spread=2.0)
 
 ROBUSTNESS: tuple[Study, ...] = (
-    Study(
+    _by_factor(
         "friction",
         "What if friction is not what trials assume?",
-        REPORT_SCENES,
-        _factors("friction", lambda factor: Mismatch(friction=factor)),
-        axis="true friction as a multiple of what trials assume",
-        logarithmic=True,
+        "true friction as a multiple of what trials assume",
+        lambda factor: Mismatch(friction=factor),
     ),
-    Study(
+    _by_factor(
         "friction-without-trials",
         "What if friction is not as usual, and nothing is tried out?",
-        REPORT_SCENES,
-        _factors("friction", lambda factor: Mismatch(friction=factor), rehearsal="none"),
-        axis="true friction as a multiple of the usual",
-        logarithmic=True,
+        "true friction as a multiple of the usual",
+        lambda factor: Mismatch(friction=factor),
+        rehearsal="none",
     ),
-    Study(
+    _by_factor(
         "mass",
         "What if masses are not what trials assume?",
-        REPORT_SCENES,
-        _factors("mass", lambda factor: Mismatch(mass=factor)),
-        axis="true masses as a multiple of what trials assume",
-        logarithmic=True,
+        "true masses as a multiple of what trials assume",
+        lambda factor: Mismatch(mass=factor),
     ),
     Study(
         "friction-and-mass",
