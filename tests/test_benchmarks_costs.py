@@ -63,6 +63,23 @@ def test_costs_are_those_of_what_was_measured(measures, experiments):
     assert measures.running(again) == pytest.approx(again.count * with_masks / 3600)
 
 
+def test_processes_share_gpus_evenly():
+    jobs = [
+        {"start": 0, "end": 10, "part": 1},
+        {"start": 0, "end": 30, "part": 0.5},
+        {"start": 4, "end": 10, "part": 0},
+    ]
+    # Two share two GPUs for 4 s, three for 6 s, then one has a GPU for itself for 20 s.
+    assert costs_page.gpu_seconds(jobs, 2) == pytest.approx(4 * 1.5 + 6 * 1.5 * 2 / 3 + 20 * 0.5)
+    assert costs_page.gpu_seconds(jobs, 1) == pytest.approx(4 * 1.5 / 2 + 6 * 1.5 / 3 + 20 * 0.5)
+    assert costs_page.gpu_seconds([], 1) == 0.0
+
+
+def test_the_clock_counts_every_episode_of_table_1_once(experiments):
+    counted = costs_page.clock(Stored(ROOT / "benchmarks/results"))
+    assert counted["episodes"] == experiments["Table 1"].count
+
+
 def test_dry_runs_count_as_the_page_does(measures, monkeypatch, tmp_path):
     """Also of episodes that are natively simulated, which take a time of their own."""
     monkeypatch.setattr(estimate, "versions", lambda: {"device": H100})

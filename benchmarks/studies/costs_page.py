@@ -33,9 +33,11 @@ RECOGNITIONS: tuple[RecognitionName, ...] = ("oracle", "masks", "full")
 STRICT: tuple[ProtocolName, ...] = ("strict",)
 # Of a table that is run by more than the strict protocol.
 PROTOCOLS: Mapping[str, tuple[ProtocolName, ...]] = {"table1": ("strict", "published-code")}
-# The seeds of Table 1 beside the first, of one variant.
 # How rates of episodes grow, in the folder of results.
 SCALING = "scaling-h200.jsonl"
+# When the processes of Table 1 began and ended, in the folder of results.
+CLOCK = "table1-clock-h200"
+# The seeds of Table 1 beside the first, of one variant.
 MORE_SEEDS = 3
 # On a GPU; protocol published-code tries one action after the other, which takes no batches.
 ENGINES: Mapping[ProtocolName, EngineName] = {"strict": "MjxSimulator", "published-code": "NativeSimulator"}
@@ -185,6 +187,30 @@ def scaling(measured: Sequence[Measured]) -> str:
     return "; ".join(several)
 
 
+def gpu_seconds(jobs: Sequence[Mapping[str, Any]], gpus: int) -> float:
+    """What processes that shared GPUs evenly took of them, each weighted with its `part` [s].
+
+    Args:
+      jobs: with `start` and `end` [s], and `part`, the share of the process's time that counts.
+      gpus: how many there were. A process uses one, so fewer processes than GPUs leave some idle, which count for none.
+    """
+    times = sorted({job[name] for job in jobs for name in ("start", "end")})
+    total = 0.0
+    for begin, end in itertools.pairwise(times):
+        running = [job for job in jobs if job["start"] <= begin and end <= job["end"]]
+        total += (end - begin) * sum(job["part"] for job in running) * min(1.0, gpus / max(len(running), 1))
+    return total
+
+
+def clock(stored: Stored) -> dict[str, int | float]:
+    """What Table 1 took by the clock: its episodes, and the time of one GPU [s]."""
+    sittings = stored[CLOCK]["sittings"]
+    return {
+        "episodes": sum(job["episodes"] for sitting in sittings for job in sitting["jobs"]),
+        "seconds": sum(gpu_seconds(sitting["jobs"], sitting["gpus"]) for sitting in sittings),
+    }
+
+
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template."""
     measures, parts = Measures.of(stored), experiments()
@@ -203,6 +229,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "cores": sum(part.count for part in parts) * measures.cpu / HOUR / 64,
         "report": reports["report"],
         "rows": stored["report-cpu"]["rows"],
+        "clock": clock(stored),
         "scaling": scaling(read_measured(stored.folder / SCALING)),
     }
 
