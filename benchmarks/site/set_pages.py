@@ -255,6 +255,18 @@ def _tidy(text: str) -> str:
     return "\n".join(lines).strip() + "\n"
 
 
+def _unused(lines: Iterable[Line]) -> str:
+    """Which of the sets to report with nothing ran on yet, as a sentence; where there is none, what to do instead."""
+    used = {line["scene_set"] for line in lines}
+    left = [f"`{name}`" for name in sets_of("report") if name not in used]
+    if left:
+        return f"of the sets [`report-*`](report.md) one that nothing ran on yet: {', '.join(left)}."
+    return (
+        "a new set, declared beside the sets [`report-*`](report.md) in `envs/scenes/scene_sets.py`, for something ran "
+        "on each of these."
+    )
+
+
 def index_page(lines: Sequence[Line]) -> str:
     """The page that lists all sets, in Markdown."""
     rows = []
@@ -278,8 +290,7 @@ Which one?
 - **To try something**: `development`, as often as you like.
 - **To compare with the paper**: `c2`, `d1`, `d2`, `d3`. Of `c2` report numbers 090 and up: settings were chosen on the
   others.
-- **To report a change**: one of the sets [`report-*`](report.md) that nothing ran on yet. Decide what you compare
-  before you run it.
+- **To report a change**: {_unused(lines)} Decide what you compare before you run it.
 - **To see what another shelf does**: `shelf-*`.
 
 ## How they are made
