@@ -17,8 +17,9 @@ from typing import Any
 from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, THREE_AHEAD
-from mechsearch_jax.benchmarks.store.rows import options_of
+from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
+from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
@@ -27,10 +28,8 @@ from mechsearch_jax.runtime.files import PathLike
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
-# Of today's default, and of the former one with collision-free grasps alone. Fields of the page are named after them.
-RUNS = ("table1-h200", "first-actions-h200", "collision-free-h100")
-# Episodes from images on scenes of which true shapes have as many.
-FULL = "`full`, `report-c`, `report-d`"
+# Of today's default. Fields of the page are named after them.
+RUNS = ("table1-h200", "report-e-h200", "collision-free-h200", "first-actions-h200")
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -167,33 +166,60 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
-def _on_new_scenes(runs: Iterable[StoredRun], method: Method) -> list[Episode]:
-    """The episodes with the method's settings on scenes that nothing was chosen on."""
+def _on_new_scenes(run: StoredRun, method: Method) -> list[Row]:
+    """The rows with the method's settings on scenes that nothing was chosen on."""
     settings = method.options()
-    rows = [row for run in runs for row in run.rows if not is_chosen_on(row.scenario)]
-    return [vars(row) for row in rows if all(options_of(row).get(name) == value for name, value in settings.items())]
+    rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
+    return [row for row in rows if all(options_of(row).get(name) == value for name, value in settings.items())]
 
 
-def default_rates(table1: StoredRun, first_actions: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
+def _named(label: str, rows: Sequence[Row]) -> dict[str, list[Episode]]:
+    """Rows as episodes, by a label that says with how many seeds where there are several."""
+    seeds = len({row.seed for row in rows})
+    return {f"{label}, {seeds} seeds" if seeds > 1 else label: [vars(row) for row in rows]}
+
+
+def _loss(full: Sequence[Row], true: Sequence[Row]) -> dict[str, Any]:
+    """How many points fewer are retrieved from images than with true shapes, in words: `pairs`, `all` with its 95%
+    interval, and `each` by number of objects."""
+    pairs = same_episodes(full, true)
+    change = change_of(pairs, OUTCOMES["retrieved"])
+    assert change.mean is not None
+    assert change.interval is not None
+    low, high = (100 * bound for bound in change.interval)
+    means = [change_of(same_episodes(full, true, count), OUTCOMES["retrieved"]).mean or 0.0 for count in COUNTS]
+    return {
+        "pairs": change.pairs,
+        "all": f"{100 * change.mean:+.1f} ({low:+.1f} to {high:+.1f})",
+        "each": ", ".join(f"{100 * mean:+.1f}" for mean in means),
+    }
+
+
+def default_rates(
+    table1: StoredRun, report_e: StoredRun, collision_free: StoredRun, first_actions: StoredRun
+) -> dict[str, Any]:
     """The fields of the template about what the default reaches, with true shapes and from images."""
     usual = Method()
     masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
-    former = usual.config.with_options(**FORMER_STANDARDS[THREE_AHEAD], retrieval_contact=False)
-    grasps = dataclasses.replace(masks, config=former)
-    default = {
-        "`c2` 090 to 179": _on_new_scenes([table1], usual),
-        "`report-c`, `report-d`": _on_new_scenes([first_actions], usual),
-    }
-    images = {
-        "`masks`, `c2`, 4 seeds": _on_new_scenes([table1], masks),
-        f"`masks`, `c2`, 4 seeds, collision-free grasps only, {THREE_AHEAD}": _on_new_scenes([collision_free], grasps),
-        "`full`, `c2`": _on_new_scenes([table1], full),
-        FULL: _on_new_scenes([first_actions], full),
-    }
+    grasps = dataclasses.replace(masks, config=usual.config.with_options(retrieval_contact=False))
+    new, new_full = (_on_new_scenes(report_e, method) for method in (usual, full))
+    default = {**_named("`c2` 090 to 179", _on_new_scenes(table1, usual)), **_named("`report-e`", new)}
+    free = _named("`masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, grasps))
+    seen = _named("`full`, `report-e`", new_full)
     return {
         "default_rates": rates("scenes", default),
-        "default_mishaps": mishaps({**default, FULL: images[FULL]}),
-        "image_rates": rates("recognition", images),
+        "default_mishaps": mishaps({**default, **seen}),
+        "image_rates": rates(
+            "recognition",
+            {
+                **_named("`masks`, `c2`", _on_new_scenes(table1, masks)),
+                **free,
+                **_named("`full`, `c2`", _on_new_scenes(table1, full)),
+                **seen,
+            },
+        ),
+        "loss": _loss(new_full, new),
+        "loss_before": _loss(*(_on_new_scenes(first_actions, method) for method in (full, usual))),
     }
 
 
