@@ -126,6 +126,15 @@ def test_a_set_that_nothing_ran_on_says_so():
     assert "Nothing that is stored ran on it yet." in rates_on("shelf-wide")
 
 
+def test_the_list_names_the_sets_that_nothing_ran_on_yet():
+    used = [{**line(2, 0.9), "scene_set": f"report-{letter}"} for letter in "abce"]
+    assert "**To report a change**: of the sets [`report-*`](report.md) one that nothing ran on yet: `report-d`. " in (
+        set_pages.index_page(used)
+    )
+    used.append({**line(2, 0.9), "scene_set": "report-d"})
+    assert "**To report a change**: a new set, declared beside" in set_pages.index_page(used)
+
+
 def test_sets_on_one_page_have_rates_of_their_own():
     lines = [{**line(2, 0.9), "scene_set": "report-b"}]
     text = set_pages.page("report", lines, ROOT / "benchmarks/results")
