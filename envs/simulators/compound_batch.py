@@ -1,8 +1,8 @@
 """Compounds in the model of many worlds at once.
 
 Every slot of an object has room for the same number of solids of each kind, so that all scenes share one compiled
-program; rows without a solid shrink to a millimetre inside the first one. Convex polyhedra have no room: Warp keeps the
-vertices of meshes in the model, so that every new mesh would have to be compiled.
+program; rows without a solid shrink to a millimetre inside the thickest one, where nothing touches them. Convex
+polyhedra have no room: Warp keeps the vertices of meshes in the model, so that every new mesh would have to be compiled.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -178,9 +178,18 @@ def _rows(
 
     used = taken(of_kind)
     half = jnp.where(used[..., None], taken(solids.half_size) - models.MARGIN, models.TINY)
-    # What is not used hides inside the first solid.
-    position = jnp.where(used[..., None], taken(solids.position), solids.position[:, :, :1])
+    position = jnp.where(used[..., None], taken(solids.position), _hiding_place(solids)[:, :, None])
     return half, position, taken(solids.rotation), used
+
+
+def _hiding_place(solids: Solids) -> Float[Array, "w 8 3"]:
+    """The middle of each body's thickest solid, in its frame [m]: where rows are that are not used.
+
+    In a thin one, such as the rim under a can, they would touch what the body stands on, with up to four contacts each.
+    """
+    thickness = jnp.where(solids.valid, solids.half_size.min(axis=-1), 0.0)
+    thickest = jnp.argmax(thickness, axis=-1)[..., None, None]
+    return jnp.take_along_axis(solids.position, thickest, axis=2)[:, :, 0]
 
 
 def _quaternions(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 4"]:

@@ -43,18 +43,26 @@ class MjxConfig:
       simulator: as for the native simulator; `trace_every` is ignored, there are no traces.
       contacts: capacity for contacts, per world on average; the buffer is shared.
       rows: capacity for constraint rows in every world.
+      compound_contacts, compound_rows: the same of worlds of compounds, whose many solids touch more at once. C MuJoCo
+        needs 55 contacts and 221 rows at most in household scenes with eight objects; Warp may find more.
       chunk: time steps between checks whether all worlds are done.
     """
 
     simulator: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
     contacts: int = 64
     rows: int = 320
+    compound_contacts: int = 96
+    compound_rows: int = 480
     chunk: int = 25
 
     def __post_init__(self):
-        for name in ("contacts", "rows", "chunk"):
+        for name in ("contacts", "rows", "compound_contacts", "compound_rows", "chunk"):
             if getattr(self, name) < 1:
                 raise InputError(f"MjxConfig: {name} {getattr(self, name)} must be at least 1")
+
+    def capacity(self, compounds: bool) -> tuple[int, int]:
+        """The capacities for contacts and for constraint rows of a world, with or without compounds."""
+        return (self.compound_contacts, self.compound_rows) if compounds else (self.contacts, self.rows)
 
 
 def import_mjx() -> Any:
@@ -98,6 +106,7 @@ class MjxModel:
         """
         self._mjx = import_mjx()
         self._config = config
+        self._contacts, self._rows = config.capacity(compounds)
         self.compounds = compounds
         self._fields = CompoundFields if compounds else BodyFields
         slots = ROOM if compounds else {}
@@ -145,19 +154,19 @@ class MjxModel:
         with jax.ensure_compile_time_eval():
             # MJX commits the data to a device, which would commit all results; functions compiled for uncommitted
             # arrays would be compiled again for them.
-            single = jax.device_get(self._single(self._config.contacts * worlds))
+            single = jax.device_get(self._single(self._contacts * worlds))
         return jax.jit(_repeated)(jnp.arange(worlds), single)
 
     def data_shapes(self, worlds: int) -> Any:
         """The shapes of `make_data`."""
-        single = jax.device_get(self._single(self._config.contacts * worlds))
+        single = jax.device_get(self._single(self._contacts * worlds))
         return jax.eval_shape(_repeated, jnp.arange(worlds), single)
 
     def kernels(self, worlds: int) -> Callable[[], None] | None:
         """Begin to compile Warp's kernels for `worlds` worlds in another process; see `compile_kernels`."""
         device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
         batched = tuple(self._fields.__dataclass_fields__)
-        return compile_kernels(self.blank, batched, worlds, self._config.contacts * worlds, self._config.rows, device)
+        return compile_kernels(self.blank, batched, worlds, self._contacts * worlds, self._rows, device)
 
     def step(self, fields: BodyFields, data: Any) -> Any:
         """The state of all worlds one time step later."""
@@ -182,11 +191,11 @@ class MjxModel:
         longest = stretches + plan.close_steps + plan.open_steps
         # The commands of each kind of motion and of the chosen one, and the joint angles that they are computed from.
         commands = 8 * longest * ROBOT * np.dtype(np.float32).itemsize
-        return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(self._single(self._config.contacts))) + commands
+        return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(self._single(self._contacts))) + commands
 
     def _single(self, contacts: int) -> Any:
         """The data of a single world."""
-        return self._mjx.make_data(self.blank, impl="warp", naconmax=contacts, njmax=self._config.rows)
+        return self._mjx.make_data(self.blank, impl="warp", naconmax=contacts, njmax=self._rows)
 
     def _touches(self, contacts: Any, side: str) -> Array:
         """In which worlds a finger presses on the target."""
