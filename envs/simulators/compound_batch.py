@@ -1,8 +1,8 @@
 """Compounds in the model of many worlds at once.
 
 Every slot of an object has room for the same number of solids of each kind, so that all scenes share one compiled
-program; rows without a solid shrink to a millimetre inside the thickest one, where nothing touches them. Convex
-polyhedra have no room: Warp keeps the vertices of meshes in the model, so that every new mesh would have to be compiled.
+program; rows without a solid shrink to a millimetre inside the thickest one, where nothing touches them. There is no
+room for convex polyhedra: Warp keeps the vertices of meshes in the model, so that every new mesh would be compiled.
 """
 
 # The bindings of MuJoCo come without type stubs.
