@@ -178,9 +178,10 @@ def test_without_warp_one_line_tells_what_to_install(monkeypatch):
     assert "\n" not in str(complaint.value)
 
 
-def test_a_capacity_of_nothing_is_refused():
-    with pytest.raises(InputError, match="rows 0 must be at least 1"):
-        MjxConfig(rows=0)
+@pytest.mark.parametrize("name", ["contacts", "rows", "compound_contacts", "compound_rows"])
+def test_a_capacity_of_nothing_is_refused(name):
+    with pytest.raises(InputError, match=f"{name} 0 must be at least 1"):
+        MjxConfig(**{name: 0})
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_f
 from mechsearch_jax.envs.simulators.compound_batch import ROOM, CompoundFields, compound_fields
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
+from mechsearch_jax.envs.simulators.warp_streams import keep_streams
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World
@@ -77,6 +78,7 @@ def import_mjx() -> Any:
         # By default Warp prints a line for itself and for every kernel that it loads.
         if warp.config.log_level == warp.LOG_INFO:
             warp.config.log_level = warp.LOG_WARNING
+        keep_streams(warp.Stream)
         from mujoco import mjx
     except (ImportError, RuntimeError) as error:
         reason = " ".join(str(error).split())
