@@ -132,7 +132,9 @@ class Together(Stand):
 
 def test_a_batch_that_fails_is_run_again_in_halves(problem, tmp_path, files, monkeypatch):
     stand = Together(problem, monkeypatch, lambda name, slots: ValueError("no") if name == "hidden-1" else None)
-    rows = evaluate(jobs_of(files, seeds=(0, 1)), tmp_path / "rows", Batches(worlds=8))
+    said = []
+    rows = evaluate(jobs_of(files, seeds=(0, 1)), tmp_path / "rows", Batches(worlds=8, again=said.append))
+    assert said[0] == "8 episodes are run again in halves, because of ValueError: no"
     failed = {(row.scenario, row.seed): row.failure for row in rows if row.failure != "not found"}
     assert failed == {("hidden-1", seed): "error: ValueError: no" for seed in (0, 1)}
     assert len(read_rows(tmp_path / "rows")) == 8

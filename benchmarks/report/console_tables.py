@@ -343,6 +343,10 @@ class EpisodeProgress:
             self._console.print(text, soft_wrap=True)
         self._bar.update(self._task, stage=text)
 
+    def again(self, text: str) -> None:
+        """Say what failed, and that episodes are run again."""
+        self._console.print(text, soft_wrap=True, markup=False)
+
     def waiting(self, episodes: int) -> None:
         """Say that other processes run what is left."""
         if not self._console.is_terminal and not self._waited:

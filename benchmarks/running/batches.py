@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 
 import jax
 
-from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
+from mechsearch_jax.benchmarks.running.evaluate import Job, in_a_line, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
@@ -66,11 +66,13 @@ class Batches:
       worlds: how many at the same time; as many as fit the device's memory, within reason, if None.
       busy: called with every stage and how many episodes are in it.
       compiling: called with what is being compiled, where anything is.
+      again: called with a line that says what failed when episodes are run again, which takes as long as before.
     """
 
     worlds: int | None = None
     busy: Callable[[str, int], None] = lambda stage, episodes: None
     compiling: Callable[[str], None] = lambda text: None
+    again: Callable[[str], None] = lambda text: None
 
     def __call__(
         self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
@@ -123,6 +125,7 @@ class Batches:
                         if worlds == 1:
                             raise
                         worlds //= 2
+                        self.again(f"the device's memory does not suffice; going on with {worlds} at the same time")
                         batches += batch.again()
                     elif not batch.running:
                         raise
@@ -130,6 +133,8 @@ class Batches:
                         batches += batch.rest()
                         failures.add(batch.running[0], error)
                     else:
+                        count = len(batch.running)
+                        self.again(f"{count} episodes are run again in halves, because of {in_a_line(error)}")
                         batches += batch.halves()
 
     def _run(self, batch: _Batch, ended: Callable[[Sequence[Row]], None], means: _Means) -> None:

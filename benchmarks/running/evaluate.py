@@ -63,7 +63,12 @@ class Job:
 
     def failed_by(self, error: BaseException) -> Row:
         """The same, where an exception says why."""
-        return self.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
+        return self.failed(in_a_line(error))
+
+
+def in_a_line(error: BaseException) -> str:
+    """An exception's kind and text, in one line of 500 characters at most."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]
 
 
 @functools.lru_cache(maxsize=4096)

@@ -162,7 +162,7 @@ class Here:
         if in_processes:
             return Processes(run.workers or cores(), run.time_limit or TIME_LIMIT)
         keep_compilations()
-        return Batches(run.batch, progress.busy, progress.compiling)
+        return Batches(run.batch, progress.busy, progress.compiling, progress.again)
 
 
 @dataclasses.dataclass(frozen=True)
