@@ -12,7 +12,7 @@ import json
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,12 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
-from mechsearch_jax.envs.cell.loading import load_searcher
+from mechsearch_jax.envs.cell.loading import searcher_of
 from mechsearch_jax.envs.cell.simulated_cell import SensorNoise, SimulatedCell
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.problem.cache import keep_compilations
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, read_json, save_json
@@ -44,11 +46,53 @@ ASTRAY = 0.06
 
 
 @dataclasses.dataclass(frozen=True)
+class Conditions:
+    """What differs from search to search, in turn: the number of objects fastest, then the target's colour, then noise.
+
+    All depends on a scene's seed alone, so that a run can be divided.
+
+    Attributes:
+      objects: numbers of objects.
+      colours: of the target, red, green and blue in 0 to 1; the configuration file's if empty.
+      colour_noise: standard deviations of every channel of the camera's images, in shares of full brightness.
+      depth_noise: standard deviation of the depth [m].
+    """
+
+    objects: tuple[int, ...] = (2, 4, 6)
+    colours: tuple[tuple[float, float, float], ...] = ()
+    colour_noise: tuple[float, ...] = (4 / 255,)
+    depth_noise: float = 0.001
+
+    def __post_init__(self):
+        for colour in self.colours:
+            TargetColour.lit(colour)
+        for noise in self.colour_noise:
+            SensorNoise(depth=self.depth_noise, colour=noise)
+
+    def count(self, seed: int) -> int:
+        """The number of objects."""
+        return self.objects[seed % len(self.objects)]
+
+    def settings(self, settings: Settings, seed: int) -> Settings:
+        """The settings with the target's colour."""
+        if not self.colours:
+            return settings
+        colour = self.colours[seed // len(self.objects) % len(self.colours)]
+        return dataclasses.replace(settings, workcell=dataclasses.replace(settings.workcell, colour=colour))
+
+    def noise(self, seed: int) -> SensorNoise:
+        """The camera's noise."""
+        turn = seed // (len(self.objects) * max(len(self.colours), 1))
+        return SensorNoise(depth=self.depth_noise, colour=self.colour_noise[turn % len(self.colour_noise)])
+
+
+@dataclasses.dataclass(frozen=True)
 class Row:
     """The result of one search.
 
     Attributes:
       seed, objects: of the scene.
+      colour, colour_noise: of the target, red, green and blue in 0 to 1, and of the camera.
       retrieved: whether the target was taken out and nothing fell off the board.
       found_step: number of motions before the target was first seen; None if it never was.
       motions: number of planned motions.
@@ -66,6 +110,8 @@ class Row:
 
     seed: int
     objects: int
+    colour: tuple[float, float, float]
+    colour_noise: float
     retrieved: bool
     found_step: int | None
     motions: int
@@ -85,7 +131,6 @@ def run_search(
     searcher: Searcher,
     cell: SimulatedCell,
     seed: int,
-    objects: int,
     max_motions: int,
     on_step: Callable[[SearchStep], None] = lambda step: None,
 ) -> Row:
@@ -94,7 +139,7 @@ def run_search(
     Args:
       searcher: new.
       cell: set up with a scene.
-      seed, objects: of the scene.
+      seed: of the scene.
       max_motions: largest number of motions.
       on_step: called with every step.
     """
@@ -140,7 +185,9 @@ def run_search(
         ended, error = "error", traceback.format_exc()
     return Row(
         seed=seed,
-        objects=objects,
+        objects=len(cell.scenario("now").objects),
+        colour=cell.workcell.colour,
+        colour_noise=cell.noise.colour,
         retrieved=retrieved,
         found_step=found_step,
         motions=len(actions),
@@ -189,25 +236,21 @@ def _inside(
     return np.all(np.abs((points - centre) @ rotation) <= np.maximum(half, 0.0), axis=1)
 
 
-def scenes(settings: Settings, objects: Sequence[int], searches: int, seed: int) -> list[tuple[int, Scenario]]:
+def scenes(settings: Settings, conditions: Conditions, seeds: Iterable[int]) -> list[tuple[int, Scenario]]:
     """Scenes with a hidden target in a cell, with their seeds.
-
-    The number of objects depends on the seed alone, so that a run can be divided.
 
     Raises:
       InputError: no target can be hidden in the cell.
     """
     generator = ScenarioGenerator.of(settings)
-    return [(s, generator.generate(s, objects[s % len(objects)])) for s in range(seed, seed + searches)]
+    return [(seed, generator.generate(seed, conditions.count(seed))) for seed in seeds]
 
 
 def run_cell(
     config: Path,
     out: Path,
-    objects: Sequence[int],
-    searches: int,
-    seed: int,
-    noise: SensorNoise,
+    conditions: Conditions,
+    seeds: Sequence[int],
     on_progress: Callable[[int, str], None] = lambda done, next_search: None,
 ) -> list[Row]:
     """Run searches in the cell of a configuration file; those with a row in the folder are not run again.
@@ -215,10 +258,8 @@ def run_cell(
     Args:
       config: the file.
       out: folder for a row of every search, and pictures of those that failed.
-      objects: numbers of objects, taken in turn.
-      searches: number of searches.
-      seed: of the first scene; the others follow.
-      noise: of the camera.
+      conditions: what differs from search to search.
+      seeds: of the scenes.
       on_progress: called with the number of searches so far, and a description of the next.
 
     Raises:
@@ -227,29 +268,29 @@ def run_cell(
     settings = load_settings(config)
     identity = {
         "config": config.read_text(encoding="utf-8"),
-        "noise": dataclasses.asdict(noise),
+        "conditions": json.loads(json.dumps(dataclasses.asdict(conditions))),
         "code": present_code(),
     }
+    keep_compilations()
     rows = []
     on_progress(0, "preparing")
-    for number, (scene_seed, scenario) in enumerate(scenes(settings, objects, searches, seed)):
-        file = out / f"search-{scene_seed}-{len(scenario.objects)}.json"
+    for number, (seed, scenario) in enumerate(scenes(settings, conditions, seeds)):
+        file = out / f"search-{seed}-{len(scenario.objects)}.json"
         if file.is_file():
             rows.append(_read_row(file, identity))
             continue
-        on_progress(number, f"{len(scenario.objects)} objects, seed {scene_seed}")
+        on_progress(number, f"{len(scenario.objects)} objects, seed {seed}")
         steps: list[SearchStep] = []
-        cell = SimulatedCell(
-            settings.workcell, scenario, noise=noise, target_colour=settings.workcell.colour, seed=scene_seed
-        )
-        searcher = load_searcher(config, seed=scene_seed)
-        row = run_search(searcher, cell, scene_seed, len(scenario.objects), settings.config.max_steps + 1, steps.append)
+        own = conditions.settings(settings, seed)
+        noise, colour = conditions.noise(seed), own.workcell.colour
+        cell = SimulatedCell(own.workcell, scenario, noise=noise, target_colour=colour, seed=seed)
+        row = run_search(searcher_of(own, seed=seed), cell, seed, own.config.max_steps + 1, steps.append)
         if steps and not row.retrieved:
             for step in steps:
-                step.picture.savefig(out / f"search-{scene_seed}-{step.index}.png")
+                step.picture.savefig(out / f"search-{seed}-{step.index}.png")
         save_json({**identity, "row": dataclasses.asdict(row)}, file)
         rows.append(row)
-    on_progress(searches, "done")
+    on_progress(len(seeds), "done")
     return rows
 
 
@@ -258,7 +299,7 @@ def _read_row(file: Path, identity: dict[str, Any]) -> Row:
     if any(value.get(name) != expected for name, expected in identity.items()):
         raise InputError(f"{file}: is of another configuration, noise or code; give an empty folder with --out")
     row = value["row"]
-    tuples = {name: tuple(row[name]) for name in ("idle", "actions", "seconds")}
+    tuples = {name: tuple(row[name]) for name in ("colour", "idle", "actions", "seconds")}
     return Row(**{**row, **tuples})
 
 
@@ -302,7 +343,7 @@ def cell_table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def save_rows(rows: Sequence[Row], config: Path, noise: SensorNoise, command: str, path: PathLike) -> None:
+def save_rows(rows: Sequence[Row], config: Path, conditions: Conditions, command: str, path: PathLike) -> None:
     """Write all rows with their summary.
 
     Raises:
@@ -314,7 +355,7 @@ def save_rows(rows: Sequence[Row], config: Path, noise: SensorNoise, command: st
             "code": present_code(),
             "versions": versions(),
             "config": config.read_text(encoding="utf-8"),
-            "noise": dataclasses.asdict(noise),
+            "conditions": dataclasses.asdict(conditions),
             "summary": summary(rows),
             "rows": [json.loads(json.dumps(dataclasses.asdict(row))) for row in rows],
         },

@@ -174,8 +174,9 @@ def bench_cell(
     objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (2, 4, 6),
     searches: int = 20,
     seed: int = 0,
+    colors: Annotated[tuple[tuple[float, float, float], ...], tyro.conf.arg(metavar="R G B ...")] = (),
+    color_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SHARE ...")] = (4 / 255,),
     depth_noise: float = 0.001,
-    color_noise: float = 4 / 255,
 ) -> None:
     """Search from images in a simulated cell, through a Searcher alone; status 1 where a search ended with an error.
 
@@ -186,17 +187,19 @@ def bench_cell(
       objects: numbers of objects, taken in turn.
       searches: how many, each of a scene of its own.
       seed: of the first scene; the others follow.
+      colors: red, green and blue of the target in 0 to 1, of several targets in turn; the file's if not given.
+      color_noise: standard deviations of every channel, as shares of full brightness, in turn.
       depth_noise: standard deviation of the depth [m].
-      color_noise: standard deviation of every channel, as a share of full brightness.
     """
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.parts import cell_searches as cell
-    from mechsearch_jax.envs.cell.simulated_cell import SensorNoise
     from mechsearch_jax.runtime.files import check_writable
 
-    at_least_one("bench cell", searches=searches, **{f"objects {n}": n for n in objects})
-    noise = SensorNoise(depth=depth_noise, colour=color_noise)
+    at_least_one("bench cell", searches=searches, objects=min(objects, default=0))
+    if not color_noise:
+        raise InputError("bench cell: --color-noise is without a number; leave it out, or give one, as 0.016")
+    conditions = cell.Conditions(objects, colors, color_noise, depth_noise)
     check_writable(out)
     console = Console(highlight=False)
     with console.status("preparing") as status:
@@ -207,8 +210,8 @@ def bench_cell(
             if not console.is_terminal:
                 console.print(line, soft_wrap=True)
 
-        rows = cell.run_cell(config, out, objects, searches, seed, noise, progress)
-    cell.save_rows(rows, config, noise, _command(), out / "cell.json")
+        rows = cell.run_cell(config, out, conditions, range(seed, seed + searches), progress)
+    cell.save_rows(rows, config, conditions, _command(), out / "cell.json")
     console.print(cell.cell_table(rows))
     console.print(str(out / "cell.json"), soft_wrap=True)
     if any(row.error for row in rows):
