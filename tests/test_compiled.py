@@ -69,6 +69,19 @@ def test_a_second_process_traces_nothing(folder):
     jax.tree.map(np.testing.assert_array_equal, as_numbers(second), expected)
 
 
+def test_a_folder_that_is_named_again_has_nothing_loaded_anew(folder, monkeypatch):
+    function = another_process()
+    function(Camera(), VALUES)
+    loaded = []
+    monkeypatch.setattr(executables.Executables, "load", lambda *_: loaded.append("loaded"))
+    keep_in(folder)
+    function(Camera(), VALUES)
+    assert (TRACED, loaded) == (["scaled"], [])
+    keep_in(folder.parent / "another")
+    function(Camera(), VALUES)
+    assert TRACED == ["scaled", "scaled"]
+
+
 def test_what_is_data_compiles_nothing_anew(folder):
     another_process()(Camera(), VALUES, factor=3.0, config=PlannerConfig(gamma=0.9))
     again = another_process()

@@ -63,8 +63,13 @@ _TRACING = threading.RLock()
 
 
 def keep_in(folder: Path | None) -> None:
-    """Keep the executables of `kept` functions in a folder from now on; with None keep nothing."""
-    _KEEPING.executables = None if folder is None else Executables(folder)
+    """Keep the executables of `kept` functions in a folder from now on; with None keep nothing.
+
+    Those that this process has loaded from the folder stay loaded: each takes hundreds of the memory maps of which an
+    operating system allows a process some ten thousand.
+    """
+    if folder != kept_in():
+        _KEEPING.executables = None if folder is None else Executables(folder)
     _KEEPING.untraced = get_opaque_trace_state()
 
 
