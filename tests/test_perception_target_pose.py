@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mechsearch_jax.images.target_pixels import fitted_pose
 from mechsearch_jax.images.target_pose import distance, target_pose
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.workspace.camera import Camera, back_project, rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -96,3 +98,53 @@ def test_without_points_it_is_finite_and_a_batch_gives_what_each_gives_alone():
     assert np.isfinite(batch).all()
     for i in range(2):
         np.testing.assert_allclose(batch[i], fit(target, clouds[i], 100), atol=2e-4)
+
+
+SMALL = Camera(width=320, height=180, fx=152.4, fy=152.4, cx=160.0, cy=90.0)
+
+
+def half_hidden(target, pose, shown, side):
+    """float64: the depth of a target before the back wall, of which a plate close before it leaves a part of its width.
+
+    Args:
+      shown: the part that is seen [m], at its left end as the camera sees it for side 1, at its right for side -1.
+    """
+    along, origin = np.asarray(rays(SMALL), np.float64), np.array(SMALL.position)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    R, centre = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([pose[0], pose[1], target.height(SHELF)])
+    start, way = R.T @ (origin - centre), along @ R
+    of_target = shape_of(target.shape).cut(list(start), [way[..., i] for i in range(3)], np.array(target.half_size), np)
+    wall, board = (SHELF.back - origin[0]) / along[..., 0], (SHELF.board - origin[2]) / along[..., 2]
+    depth = np.minimum(np.where(wall > 0, wall, np.inf), np.where(board > 0, board, np.inf))
+    # Across the view, from the camera to the target.
+    ahead = (centre - origin)[:2] / np.linalg.norm((centre - origin)[:2])
+    across = np.array([-ahead[1], ahead[0]])
+    corners = np.array([[a, b] for a in (-1, 1) for b in (-1, 1)]) * target.half_size[:2] @ R[:2, :2].T @ across
+    end = (corners * side).max() - shown
+    plate = ((centre - origin)[:2] @ ahead - 0.06) / (along[..., :2] @ ahead)
+    place = (plate[..., None] * along[..., :2]) @ across * side
+    at_target = place * ((centre - origin)[:2] @ ahead) / ((centre - origin)[:2] @ ahead - 0.06)
+    covered = (at_target < end) & (plate > 0) & (origin[2] + plate * along[..., 2] > SHELF.board)
+    depth = np.where(covered, np.minimum(depth, plate), depth)
+    return np.minimum(depth, of_target), of_target < depth
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_narrow_part_of_a_flat_face_is_at_its_end_where_nothing_hides_the_rest(side):
+    """Its points fit anywhere along the face, but a target that reached farther would be seen there."""
+    target, rng, fits = (
+        Target.box().resized("box", (0.02, 0.025, 0.06)),
+        np.random.default_rng(4),
+        jax.jit(
+            lambda points, depth, of_target: fitted_pose(
+                jax.random.key(0), target, SHELF, SMALL, points, depth, of_target
+            )[0]
+        ),
+    )
+    for yaw in (0.0, 0.4, 1.2):
+        pose = np.array([0.65, 0.1, yaw])
+        depth, of_target = half_hidden(target, pose, 0.012, side)
+        assert 20 < of_target.sum() < 400
+        depth = jnp.float32(depth + rng.normal(scale=0.0005, size=depth.shape))
+        fitted = np.asarray(fits(back_project(SMALL, depth), depth, jnp.asarray(of_target)))
+        assert np.linalg.norm(fitted[:2] - pose[:2]) < 0.01, (yaw, fitted, of_target.sum())

@@ -10,18 +10,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.images.cloud import draw
 from mechsearch_jax.images.labels import INSTANCES, OTHER
-from mechsearch_jax.images.target_pose import distance, target_pose
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.images.target_evidence import Sample, depth_tolerance, evidence, upright
+from mechsearch_jax.images.target_pose import distance, target_poses
+from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 # Number of points for fitting the target's pose.
 TARGET_POINTS = 256
+# Where its fits begin, see `target_poses`, and the number of pixels near it by which they are compared.
+SIDES, BESIDE = (0.0, -0.5, 0.5, -1.0, 1.0), 1024
+# Fits whose evidence differs by less than this share of the best one's are compared by the distances of points alone.
+EQUAL = 0.03
 # Neighbours are pixels within a square of this width whose depth differs by at most `LIKE_DEPTH` [m] and, where colours
 # are averaged, whose colour differs by at most `LIKE_COLOUR`, as the length of the difference of red, green and blue:
 # with noise of 8/255 in each channel, one in a thousand differs more.
@@ -82,21 +88,40 @@ def fitted_pose(
     shelf: Shelf,
     camera: Camera,
     points: Float[Array, "h w 3"],
+    depth: Float[Array, "h w"],
     of_target: Bool[Array, "h w"],
 ) -> tuple[Float[Array, " 3"], Bool[Array, ""]]:
     """The pose of the target from its pixels: x, y [m] and yaw [rad]; and whether it has any pixels.
+
+    Of the poses that its points fit equally well, it is one where nothing is seen behind the target's surface.
 
     Args:
       key: PRNG key of the drawn points.
       target: static.
       shelf, camera: of the image.
       points: in the world [m].
+      depth: of the points [m]; NaN where nothing was measured, infinite where there is nothing.
       of_target: the target's pixels; if there are none, the pose is meaningless, but finite.
     """
+    flat, origin = points.reshape(-1, 3), jnp.array(camera.position)
     index, count = draw(key, of_target.reshape(-1), TARGET_POINTS)
-    seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
-    pose = target_pose(target, shelf, jnp.array(camera.position), points.reshape(-1, 3)[index], seen)
-    return pose, count > 0
+    drawn, seen = flat[index], jnp.broadcast_to(count > 0, TARGET_POINTS)
+    poses, costs = target_poses(target, shelf, origin, drawn, seen, SIDES)
+    # Rays that may meet the target at one of the poses.
+    reach = 2.0 * float(sum(half**2 for half in target.half_size)) ** 0.5
+    middle = jnp.sum(jnp.where(seen[:, None], drawn, 0.0), axis=0) / TARGET_POINTS - origin
+    along = rays(camera).reshape(-1, 3)
+    nearest = jnp.sum(along * middle[None], axis=-1, keepdims=True) / jnp.sum(along**2, axis=-1, keepdims=True)
+    passes = jnp.sum((nearest * along - middle[None]) ** 2, axis=-1) < reach**2
+    beside, _ = draw(jax.random.fold_in(key, 1), passes, BESIDE)
+    chosen, tolerance = of_target.reshape(-1), depth_tolerance(depth, of_target)
+    sample = Sample(
+        along[beside], flat[beside], depth.reshape(-1)[beside], chosen[beside], jnp.broadcast_to(tolerance, BESIDE)
+    )
+    proof = jax.vmap(lambda pose: evidence(target, upright(target, shelf, pose), origin, sample))(poses)
+    worth = proof.support - proof.contrary
+    good = worth >= jnp.max(worth) - jnp.maximum(2.0, EQUAL * jnp.max(proof.support))
+    return poses[jnp.argmin(jnp.where(good, costs, jnp.inf))], count > 0
 
 
 def near_target(

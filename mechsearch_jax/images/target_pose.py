@@ -77,6 +77,46 @@ def descend(
     return pose, cost
 
 
+def target_poses(
+    target: Target,
+    shelf: Shelf,
+    camera_position: Float[Array, " 3"],
+    points: Float[Array, "p 3"],
+    valid: Bool[Array, " p"],
+    sides: tuple[float, ...] = (0.0,),
+) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+    """Poses of an upright target that stands on the board, each fitted from a start of its own, and their costs.
+
+    Robust least squares of the distance between points and surface. A flat face of which a narrow part is seen fits
+    equally well anywhere along itself: there the poses differ, and only what else is seen can tell them apart.
+
+    Args:
+      target: static.
+      shelf: on which it stands.
+      camera_position: in the world [m].
+      points: in the world [m], shape (P, 3).
+      valid: which of them are the target's, shape (P,). If none are, the poses are meaningless, but finite.
+      sides: where the starts are from the middle of the points, across the view, in radii; for each there is one of
+        each of eight yaw angles, unless the target is round.
+    """
+    weight = valid.astype(jnp.float32)
+    points = jnp.where(valid[:, None], points, 0.0)
+    count = jnp.maximum(jnp.sum(weight), 1.0)
+    centre = jnp.sum(points, axis=0)[:2] / count
+    away = centre - camera_position[:2]
+    away = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2) + 1e-12), 1e-6)
+    across = jnp.stack([-away[1], away[0]])
+    # The visible side is nearer to the camera than the centre, by about two thirds of the radius on average.
+    radius = min(target.half_size[:2])
+    xy = (centre + away * (0.65 * radius))[None] + radius * jnp.array(sides)[:, None] * across[None]
+    yaws = jnp.zeros(1) if shape_of(target.shape).round else jnp.arange(8) * (math.pi / 8)
+    starts = jnp.concatenate([jnp.repeat(xy, len(yaws), axis=0), jnp.tile(yaws, len(sides))[:, None]], axis=1)
+    residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
+    poses, costs = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
+    turned = jnp.zeros_like(costs) if shape_of(target.shape).round else jnp.mod(poses[:, 2], math.pi)
+    return poses.at[:, 2].set(turned), costs
+
+
 @functools.partial(jax.jit, static_argnames=("target",))
 def target_pose(
     target: Target,
@@ -85,10 +125,7 @@ def target_pose(
     points: Float[Array, "p 3"],
     valid: Bool[Array, " p"],
 ) -> Float[Array, " 3"]:
-    """Fit an upright target that stands on the board to points on its visible side.
-
-    Robust least squares of the distance between points and surface, from one start for each of eight yaw angles unless
-    the target is round; its pose is free by half a turn.
+    """Fit an upright target that stands on the board to points on its visible side: the best of `target_poses`.
 
     Args:
       target: static.
@@ -100,18 +137,5 @@ def target_pose(
     Returns:
       x, y [m] and yaw [rad] within half a turn; the yaw of a round target is 0.
     """
-    weight = valid.astype(jnp.float32)
-    points = jnp.where(valid[:, None], points, 0.0)
-    count = jnp.maximum(jnp.sum(weight), 1.0)
-    centre = jnp.sum(points, axis=0)[:2] / count
-    away = centre - camera_position[:2]
-    away = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2) + 1e-12), 1e-6)
-    # The visible side is nearer to the camera than the centre, by about two thirds of the radius on average.
-    xy = centre + away * (0.65 * min(target.half_size[:2]))
-    is_round = shape_of(target.shape).round
-    yaws = jnp.zeros(1) if is_round else jnp.arange(8) * (math.pi / 8)
-    starts = jnp.concatenate([jnp.broadcast_to(xy[None], (len(yaws), 2)), yaws[:, None]], axis=1)
-    residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
-    poses, costs = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
-    best = poses[jnp.argmin(costs)]
-    return best.at[2].set(0.0 if is_round else jnp.mod(best[2], math.pi))
+    poses, costs = target_poses(target, shelf, camera_position, points, valid)
+    return poses[jnp.argmin(costs)]

@@ -186,7 +186,7 @@ def explained_image(
     least: Float[Array, ""] | float = 0.0,
 ) -> Fitted:
     """The objects that explain an image; arguments as of `Fitter`, `config` is static."""
-    pose, has_pixels = fitted_pose(keys[1], target, shelf, camera, image.points, image.of_target)
+    pose, has_pixels = fitted_pose(keys[1], target, shelf, camera, image.points, image.depth, image.of_target)
     on_it = near_target(target, shelf, pose, image.points) & has_pixels
     labels = without_phantoms(image.labels, on_it, image.of_target)
     # An instance beyond the slots has no object.

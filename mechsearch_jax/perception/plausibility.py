@@ -293,7 +293,7 @@ def colour_faults(
     swapped = np.asarray(coloured_pixels(detector, jnp.asarray(exchanged), seen) & inside)
     if swapped.sum() <= least:
         return ()
-    pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, jnp.asarray(swapped))
+    pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, seen, jnp.asarray(swapped))
     from_target = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
     across, _, height = target.half_size
     whole = 4 * across * height * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2

@@ -177,7 +177,7 @@ def recognise_image(
       no pixels; and the network's `expected_error` of each object [m].
     """
     object_key, target_key = keys
-    pose, has_pixels = fitted_pose(target_key, target, shelf, camera, image.points, image.of_target)
+    pose, has_pixels = fitted_pose(target_key, target, shelf, camera, image.points, image.depth, image.of_target)
     on_it = near_target(target, shelf, pose, image.points) & has_pixels
     labels = without_phantoms(image.labels, on_it, image.of_target)
     network, parameters = shapes.network, shapes.parameters
