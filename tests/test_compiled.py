@@ -17,6 +17,7 @@ from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.runtime import compiled, executables
 from mechsearch_jax.runtime.compiled import Kept, KeptOnHost, keep_in
 from mechsearch_jax.runtime.identity import Unidentified, identity
+from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -80,6 +81,20 @@ def test_a_folder_that_is_named_again_has_nothing_loaded_anew(folder, monkeypatc
     keep_in(folder.parent / "another")
     function(Camera(), VALUES)
     assert TRACED == ["scaled", "scaled"]
+
+
+def test_the_digest_of_a_package_counts_folders_that_are_links(tmp_path, monkeypatch):
+    source, package = tmp_path / "source", tmp_path / "linkedpackage"
+    for folder in (source, package):
+        folder.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "inner").symlink_to(source, target_is_directory=True)
+    monkeypatch.syspath_prepend(tmp_path)
+    digests = set()
+    for text in ("a = 1", "a = 2"):
+        (source / "module.py").write_text(text)
+        digests.add(source_digest((".py",), ("linkedpackage",)))
+    assert len(digests) == 2
 
 
 def test_what_is_data_compiles_nothing_anew(folder):

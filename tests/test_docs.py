@@ -414,6 +414,27 @@ def test_what_came_of_searches_in_a_cell_is_what_is_stored():
     assert all(row["found_step"] is not None and not row["phantoms"] and row["error"] is None for row in rows)
     taken = f"{retrieved} of {len(rows)} targets were taken out ({low:.2f} to {high:.2f}), and all {len(rows)} found"
     assert f"{taken}; {failed} of {moved} motions failed" in " ".join(read("docs/experiments.md").split())
+    assert stored["config"] == read("benchmarks/parts/cells/other-cell.toml")
+
+
+def test_what_came_of_fifty_searches_in_a_cell_is_what_is_stored():
+    stored = json.loads(read("benchmarks/results/cell-50-cpu.json"))
+    rows, log = stored["rows"], " ".join(read("docs/experiments.md").split())
+    retrieved, found = (sum(row["retrieved"] for row in rows), sum(row["found_step"] is not None for row in rows))
+    low, high = wilson(retrieved, len(rows))
+    moved, failed = (sum(row[name] for row in rows) for name in ("motions", "failed"))
+    assert all(not row["phantoms"] and not row["undetected"] and row["error"] is None for row in rows)
+    # No search ends without a line that says why.
+    assert all(row["retrieved"] or row["idle"] for row in rows)
+    taken = f"{retrieved} of {len(rows)} targets were taken out ({low:.2f} to {high:.2f}) and {found} found"
+    assert f"{taken}; {failed} of {moved} motions failed" in log
+    share = {
+        noise: [row["retrieved"] for row in rows if round(255 * row["colour_noise"]) == noise] for noise in (0, 4, 8)
+    }
+    stated = ", ".join(f"{sum(share[noise])} of {len(share[noise])}" for noise in (0, 4, 8))
+    assert f"With noise of 0, 4 and 8/255: {stated}." in log
+    first = [row["retrieved"] for row in rows[:20]]
+    assert f"{sum(first)} of the first {len(first)}" in log
     assert f"took [{retrieved} of {len(rows)} hidden targets out](" in " ".join(read("README.md").split())
     assert stored["config"] == read("benchmarks/parts/cells/other-cell.toml")
 

@@ -41,6 +41,8 @@ from mechsearch_jax.workspace.scenario import Scenario, rotation_matrix
 PATIENCE = 3
 # A recognised object whose centre is this deep inside the target, or vice versa, is a phantom [m].
 INSIDE = 0.005
+# A recognised target whose axis is farther than this from the true one is misplaced: a hand would grasp beside it [m].
+MISPLACED = 0.02
 # A recognised object whose centre is farther than this from the centres of all bodies is astray [m].
 ASTRAY = 0.06
 
@@ -100,6 +102,7 @@ class Row:
       ended: how it ended, in a few words.
       phantoms: number of looks with an object recognised in or on a target in sight.
       undetected: number of looks with an undetected target in sight.
+      misplaced: number of looks with the target recognised where it does not stand; None in rows of before it counted.
       astray: number of looks with an object recognised where nothing stands.
       idle: reasons of the looks without a motion.
       warnings: of all looks, with their numbers.
@@ -125,6 +128,7 @@ class Row:
     actions: tuple[str, ...]
     seconds: tuple[float, ...]
     error: str | None = None
+    misplaced: int | None = None
 
 
 def run_search(
@@ -144,7 +148,7 @@ def run_search(
       on_step: called with every step.
     """
     found_step, failed, in_a_row = None, 0, 0
-    phantoms = undetected = astray = 0
+    phantoms = undetected = astray = misplaced = 0
     idle: list[str] = []
     actions: list[str] = []
     seconds: list[float] = []
@@ -160,6 +164,7 @@ def run_search(
             warnings.update(step.warnings)
             if bool(step.observation.target_visible):
                 found_step = len(actions) if found_step is None else found_step
+                misplaced += _misplaced(cell, step.observation)
             # By the true scene: the searcher may take an undetected target for an object.
             if pixels > found_pixels(cell.workcell.camera):
                 phantoms += any(_in_target(cell, step.observation))
@@ -201,7 +206,14 @@ def run_search(
         actions=tuple(actions),
         seconds=tuple(seconds),
         error=error,
+        misplaced=misplaced,
     )
+
+
+def _misplaced(cell: SimulatedCell, observation: Observation) -> bool:
+    """Whether a recognised target is not where the target stands."""
+    apart = np.asarray(observation.target_pose)[:2] - cell.scenario("now").target.position[:2]
+    return bool(np.linalg.norm(apart) > MISPLACED)
 
 
 def _in_target(cell: SimulatedCell, observation: Observation) -> list[bool]:
@@ -317,6 +329,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "failed_motions": sum(row.failed for row in rows),
         "looks_with_phantom_in_target": sum(row.phantoms for row in rows),
         "looks_with_undetected_target": sum(row.undetected for row in rows),
+        "looks_with_target_misplaced": sum(row.misplaced or 0 for row in rows),
         "looks_with_object_astray": sum(row.astray for row in rows),
         "errors": sum(row.error is not None for row in rows),
         "seconds_per_step_median": round(float(np.median(steady)), 2) if steady else None,

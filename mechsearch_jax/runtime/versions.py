@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import importlib.resources
+import os
 import platform
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,11 +29,15 @@ def versions() -> dict[str, str]:
 
 
 def source_digest(endings: Sequence[str], packages: Sequence[str] = ("mechsearch_jax",)) -> str:
-    """SHA-256, in hexadecimal, of the source that decides: files with these endings in all folders but `UNDECIDING`."""
+    """SHA-256, in hexadecimal, of the source that decides: files with these endings in all folders but `UNDECIDING`.
+
+    Folders that are links count like others: with another source behind them, what was compiled must not be used again.
+    """
     digest = hashlib.sha256()
     for package in packages:
         root = Path(str(importlib.resources.files(package)))
-        for file in sorted(file for file in root.rglob("*") if file.suffix in endings):
+        files = (Path(folder, name) for folder, _, names in os.walk(root, followlinks=True) for name in names)
+        for file in sorted(file for file in files if file.suffix in endings):
             inside = file.relative_to(root)
             if inside.parts[0] not in UNDECIDING:
                 source = file.read_bytes()
