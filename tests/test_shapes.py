@@ -21,7 +21,7 @@ from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, 
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
-from mechsearch_jax.images.target_pose import target_pose
+from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
@@ -404,8 +404,8 @@ def test_a_new_shape_is_searched_for(ball):
     points = place + surface(ball, np.array(target.half_size), 400)
     towards = np.array(Camera().position) - place
     shown = jnp.asarray((points - place) @ towards > 0)
-    pose = target_pose(target, shelf, jnp.float32(Camera().position), jnp.float32(points), shown)
-    np.testing.assert_allclose(pose, [0.6, 0.1, 0.0], atol=1e-4)
+    poses, costs = target_poses(target, shelf, jnp.float32(Camera().position), jnp.float32(points), shown)
+    np.testing.assert_allclose(poses[jnp.argmin(costs)], [0.6, 0.1, 0.0], atol=1e-4)
     axes = Figure().subplots()
     draw_target(axes, np.array([0.6, 0.1, 0.0]), target, certain=True)
     assert axes.patches[0].get_radius() == 0.025

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 
@@ -115,27 +114,3 @@ def target_poses(
     poses, costs = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
     turned = jnp.zeros_like(costs) if shape_of(target.shape).round else jnp.mod(poses[:, 2], math.pi)
     return poses.at[:, 2].set(turned), costs
-
-
-@functools.partial(jax.jit, static_argnames=("target",))
-def target_pose(
-    target: Target,
-    shelf: Shelf,
-    camera_position: Float[Array, " 3"],
-    points: Float[Array, "p 3"],
-    valid: Bool[Array, " p"],
-) -> Float[Array, " 3"]:
-    """Fit an upright target that stands on the board to points on its visible side: the best of `target_poses`.
-
-    Args:
-      target: static.
-      shelf: on which it stands.
-      camera_position: in the world [m].
-      points: in the world [m], shape (P, 3).
-      valid: which of them are the target's, shape (P,). If none are, the result is meaningless, but finite.
-
-    Returns:
-      x, y [m] and yaw [rad] within half a turn; the yaw of a round target is 0.
-    """
-    poses, costs = target_poses(target, shelf, camera_position, points, valid)
-    return poses[jnp.argmin(costs)]
