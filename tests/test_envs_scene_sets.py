@@ -85,6 +85,7 @@ DIGESTS = {
     "report-c": "13ad36aa6f21",
     "report-d": "d353835947b1",
     "report-e": "0241abbdcdcb",
+    "report-f": "c322c6892597",
     "shelf-low": "f547905348d9",
     "shelf-narrow": "aaa051492858",
     "shelf-wide": "32c83e4f2af2",

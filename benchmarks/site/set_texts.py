@@ -89,11 +89,11 @@ ABOUT: dict[str, About] = {
     ),
     "report": About(
         "to report with",
-        "Five sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
+        "Six sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
         "Each is used once, because scenes that were looked at are no longer unseen; so no picture of them is shown. "
         "Those with rates below are used: `report-a` by the baselines and the robustness [studies](../studies.md), "
         "`report-e` by what today's default [comes to](../results.md).",
-        sets=("report-a", "report-b", "report-c", "report-d", "report-e"),
+        sets=("report-a", "report-b", "report-c", "report-d", "report-e", "report-f"),
     ),
     **{
         f"shelf-{name}": About(
