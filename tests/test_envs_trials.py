@@ -23,6 +23,7 @@ from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
+from mechsearch_jax.envs.trials.nearby import Nearby
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
@@ -154,6 +155,22 @@ def test_what_is_free_to_move_may_be_hit_and_what_is_not_may_not(retrievals):
     assert retrievals["open"][1][0] == DONE
 
 
+def test_a_grasp_that_succeeds_by_a_hair_does_not_succeed_nearby(problem, retrievals):
+    """A grasp that is held up in any of the scenes near the recognised one fails; without them it does as simulated."""
+    names, fragile = ("open", "loose"), []
+    for name in names:
+        tried, results = retrievals[name]
+        seen, at = objects_and_pose(problem, SCENES[name])
+        alone = NativeTrials(nearby=Nearby(scenes=0))
+        plain = results_of(alone, problem, seen, at, True, tried.action, tried.feasible)
+        far = NativeTrials(nearby=Nearby(scenes=3, place=0.02))
+        strict = results_of(far, problem, seen, at, True, tried.action, tried.feasible)
+        done = [int(np.argmax(np.append(r, DONE) == DONE)) for r in (plain, results, strict)]
+        assert done == sorted(done), name
+        fragile.append(done[2] > done[0])
+    assert any(fragile)
+
+
 def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, retrievals):
     world = NativeWorld()
     for name in ("loose", "firm"):
@@ -274,15 +291,31 @@ def test_what_is_said_of_what_was_not_wanted_counts_for_nothing(problem):
     assert int(decision.action.kind) == ActionKind.PUSH
 
 
-def test_where_no_grasp_succeeds_one_that_hits_nothing_is_made(problem):
+def test_a_grasp_that_hits_nothing_is_made_only_if_its_trial_does_not_fail(problem):
     _, _, aside = pushes()
-    for objects, kind in ((OPEN, ActionKind.RETRIEVE), (FIRM, ActionKind.PUSH)):
+    plain = best_grasp(problem.target_grasps, *objects_and_pose(problem, OPEN))
+    one_is_known = [UNKNOWN] * (TRIES - 1) + [FAILED]
+    for objects, codes, kind in (
+        (OPEN, [UNKNOWN] * TRIES, ActionKind.RETRIEVE),
+        (OPEN, [FAILED] * TRIES, ActionKind.PUSH),
+        (OPEN, one_is_known, ActionKind.PUSH),
+        (FIRM, [FAILED] * TRIES, ActionKind.PUSH),
+    ):
         belief, observation = look(problem, objects)
-        decision = made(proposes(aside), says(*[FAILED] * TRIES), problem, belief, observation)
+        decision = made(proposes(aside), grasps_fail_as(codes), problem, belief, observation)
         assert int(decision.action.kind) == kind
         if kind == ActionKind.RETRIEVE:
-            plain = best_grasp(problem.target_grasps, *objects_and_pose(problem, objects))
             np.testing.assert_array_equal(decision.action.T_world_gripper, plain.action.T_world_gripper)
+
+
+def grasps_fail_as(codes):
+    """Trials in which grasps have these results and all else succeeds."""
+
+    def trials(problem, scenes, actions, wanted):
+        grasps = np.asarray(codes + [DONE] * wanted.shape[1])[: wanted.shape[1]]
+        return np.where(actions.kind == ActionKind.RETRIEVE, grasps[None], DONE).astype(np.int32)
+
+    return trials
 
 
 def test_a_plan_is_made_only_where_the_target_is_not_taken_out(problem):
@@ -308,11 +341,11 @@ def test_a_plan_is_made_only_where_the_target_is_not_taken_out(problem):
         assert (int(decision.action.kind), len(plans), tried) == (code, planned_, kinds)
 
 
-@pytest.mark.parametrize("found", [True, False])
-def test_one_choice_among_grasps_and_actions_is_what_two_in_turn_are(problem, found):
+@pytest.mark.parametrize(("objects", "found"), [(LOOSE, True), (LOOSE, False), (OPEN, True)])
+def test_one_choice_among_grasps_and_actions_is_what_two_in_turn_are(problem, objects, found):
     over, _, aside = pushes()
     policy = proposes(over, aside)
-    belief, observation = look(problem, LOOSE, found=found)
+    belief, observation = look(problem, objects, found=found)
     both = policy(jax.random.key(0), problem, belief, observation)
     count = TRIES if found else 0
     assert both.alternatives.sequence[:count].tolist() == [-1] * count
@@ -320,7 +353,9 @@ def test_one_choice_among_grasps_and_actions_is_what_two_in_turn_are(problem, fo
     for grasps, actions in (
         ((FAILED, DONE), (DONE,)),
         ((FAILED, HARM), (HARM, DONE)),
+        ((FAILED,) * TRIES, (FAILED, DONE)),
         ((), (FAILED, UNKNOWN)),
+        ((), (DONE,)),
         ((), ()),
     ):
         results = np.full(len(both.alternatives.worth), UNKNOWN, np.int32)

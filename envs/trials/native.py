@@ -24,13 +24,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.actions import Action, Kind, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.pushing.physics_push import bodies
 from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.compounds import with_parts
+from mechsearch_jax.envs.trials.nearby import Nearby, ScenesNear
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
@@ -38,7 +39,7 @@ from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
 from mechsearch_jax.robot.gripper import Gripper
-from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
@@ -46,6 +47,9 @@ from mechsearch_jax.session.preparing import Program, motions, program
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+
+# Scenes near that of a row; None for one that MuJoCo cannot build.
+_Near = ScenesNear[TrialScene | None]
 
 
 class Cell(NamedTuple):
@@ -61,10 +65,12 @@ class NativeTrials:
     """The `Trials` in C MuJoCo, of many scenes at once, on several threads.
 
     The same trials always give the same results. An action that the arm cannot follow fails; the result is UNKNOWN if
-    the simulation diverges or the scene is invalid. The gripper is the problem's.
+    the simulation diverges or the scene is invalid. The gripper is the problem's. A retrieval succeeds only if it does
+    so in some scenes near the recognised one as well.
 
     Attributes:
       simulation: its settings.
+      nearby: the scenes in which a retrieval has to succeed, too.
       threads: number of threads; `runtime.cores.cores` if None.
       friction: factor on all sliding frictions; with too low a friction the arm is held up in reality where it was not
         in the trial.
@@ -74,6 +80,7 @@ class NativeTrials:
     """
 
     simulation: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
+    nearby: Nearby = dataclasses.field(default_factory=Nearby)
     threads: int | None = None
     friction: float = 1.0
 
@@ -101,24 +108,29 @@ class NativeTrials:
         simulation = dataclasses.replace(self.simulation, motion=config)
         actions, scenes = jax.device_get((actions, scenes))
 
-        def make(row: int) -> tuple[World, TrialScene | None]:
-            return self._scene(cell, simulation, scenes, row)
+        def make(row: int) -> tuple[World, _Near]:
+            world, scene = self._scene(cell, simulation, scenes, row)
 
-        def attempt(
-            made: tuple[World, TrialScene | None], row: int, i: int, needed: Callable[[], bool]
-        ) -> TrialResult | None:
-            world, scene = made
+            def near(number: int) -> TrialScene | None:
+                return self._scene(cell, simulation, self.nearby.drawn(scenes, number), row)[1] if number else scene
+
+            return world, ScenesNear(near)
+
+        def attempt(made: tuple[World, _Near], row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
+            world, near = made
             action: Action = jax.tree.map(lambda a: np.asarray(a[row, i]), actions)
             kind = kind_of(int(action.kind))
             motion = jax.device_get(reference_motion(kind, action, config))
             if motion is None or not motion[1]:
                 return TrialResult.FAILED
-            if scene is None or not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
+            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
                 return TrialResult.UNKNOWN
-            try:
-                return scene.attempt(kind, motion[0], int(action.object), needed)
-            except mujoco.FatalError:
-                return TrialResult.UNKNOWN
+            result = TrialResult.UNKNOWN
+            for number in range(1 + self.nearby.scenes * kind.takes_target):
+                result = _attempted(near[number], kind, motion[0], int(action.object), needed)
+                if result is not TrialResult.SUCCEEDED:
+                    break
+            return result
 
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
 
@@ -184,6 +196,18 @@ class NativeTrials:
 
     def _motion_config(self, cell: Cell) -> MotionConfig:
         return dataclasses.replace(self.simulation.motion, gripper=cell.gripper)
+
+
+def _attempted(
+    scene: TrialScene | None, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
+) -> TrialResult | None:
+    """The result of an action in a scene; see `TrialScene.attempt`."""
+    if scene is None:
+        return TrialResult.UNKNOWN
+    try:
+        return scene.attempt(kind, reference, index, needed)
+    except mujoco.FatalError:
+        return TrialResult.UNKNOWN
 
 
 @kept(static_argnames=("target",), on_host=True)

@@ -139,25 +139,20 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         grasp = self.retrieval(key, problem, belief, observation)
         able = grasp.action.kind == ActionKind.RETRIEVE
         # The belief may be concrete while the observation is traced.
-        if not isinstance(able, Tracer):
-            if able:
-                return grasp
-            return _grasps_first(grasp, self.planned(key, problem, belief, observation))
-        # Both are computed, but the one that does not count has next to nothing to do. Under `vmap`, a `cond` would
-        # give every scene of a batch its own problem, and what they share could no longer be computed together.
-        objects = observation.objects.replace(valid=observation.objects.valid & ~able)
-        planned = self.planned(
-            key,
-            problem,
-            belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
-            observation.replace(objects=objects),
-        )
-        if planned.alternatives is not None:
-            # The plan was made without objects if the target is taken out.
-            planned = planned.replace(alternatives=planned.alternatives.replace(now=observation.objects))
-        both = _grasps_first(grasp, planned)
-        grasp = grasp.replace(alternatives=both.alternatives)
-        return jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp, both)
+        if not isinstance(able, Tracer) and able and not self.tries:
+            return grasp
+        seen = observation
+        if isinstance(able, Tracer) and not self.tries:
+            # Both are computed, but the one that does not count has next to nothing to do. Under `vmap`, a `cond` would
+            # give every scene of a batch its own problem, and what they share could no longer be computed together.
+            objects = observation.objects
+            seen = observation.replace(objects=objects.replace(valid=objects.valid & ~able))
+            belief = belief.replace(exists=belief.exists & ~able, found=belief.found & ~able)
+        planned = _grasps_first(grasp, self.planned(key, problem, belief, seen))
+        if self.tries:
+            # Where no grasp succeeds in its trial, the plan counts.
+            grasp = grasp.replace(alternatives=planned.alternatives, sequences=planned.sequences, cost=planned.cost)
+        return jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp, planned)
 
     def retrieval(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """Decide whether to take out a found target: an action of kind RETRIEVE, or else of kind NONE.

@@ -204,10 +204,10 @@ def in_turn(first: Alternatives, then: Alternatives) -> Alternatives:
 def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
     """Choose an action by the results of trials.
 
-    The first alternative that succeeds is chosen. If none does: a retrieval that the decision already makes is kept;
-    else the first alternative that begins a sequence and did no harm is chosen; else nothing. Sequences whose first
-    action did harm, or has an unknown result, or is like one of these, are refused. A decision without alternatives
-    stays unchanged.
+    The first alternative that succeeds is chosen. If none does: a retrieval that the decision already makes is kept if
+    the results of all grasps are unknown; else the first alternative that begins a sequence and did no harm is chosen;
+    else nothing. Sequences whose first action did harm, or has an unknown result, or is like one of these, are refused.
+    A decision without alternatives stays unchanged.
 
     Args:
       decision: decision of a policy.
@@ -233,11 +233,13 @@ def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
     planned = planned.replace(refused=jnp.sum(rejected))
     taken = _taken(decision, alternatives, jax.tree.map(lambda a: a[best], alternatives.actions))
     grasped = succeeds & grasps[best]
+    untried = takes & ~jnp.any(grasps & (results > TrialResult.UNKNOWN))
+    kept_grasp = _taken(decision, alternatives, decision.action)
 
-    def select(grasp, unchanged, plan):
-        return jnp.where(grasped, grasp, jnp.where(takes & ~succeeds, unchanged, plan))
+    def select(grasp, untried_grasp, plan):
+        return jnp.where(grasped, grasp, jnp.where(untried, untried_grasp, plan))
 
-    return jax.tree.map(select, taken, decision.replace(refused=jnp.int32(0)), planned)
+    return jax.tree.map(select, taken, kept_grasp, planned)
 
 
 def _planned(

@@ -1,0 +1,82 @@
+"""Scenes near a recognised one, in which a grasp of the target has to succeed, too.
+
+A grasp that brushes something may take the target out in one scene and be held up in another that is a third of a
+millimetre off, less than recognition can know. One trial says nothing of that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from mechsearch_jax.planner.trials import TrialScenes
+from mechsearch_jax.runtime.errors import InputError
+
+Scene = TypeVar("Scene")
+# Of the drawn differences, which are the same for all scenes and decisions.
+SEED = 7
+
+
+@dataclasses.dataclass(frozen=True)
+class Nearby:
+    """How many scenes near a recognised one, and how far off they are: about recognition's own error.
+
+    Attributes:
+      scenes: their number; 0 for none.
+      place: standard deviation of the places of objects and target along x and y [m].
+      size: standard deviation of the objects' sizes along their own x and y, as a share.
+
+    Raises:
+      InputError: a number is negative or not finite.
+    """
+
+    scenes: int = 3
+    place: float = 5e-4
+    size: float = 5e-3
+
+    def __post_init__(self):
+        for name in ("scenes", "place", "size"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"Nearby: {name} {getattr(self, name)} must not be negative")
+
+    def drawn(self, scenes: TrialScenes, number: int) -> TrialScenes:
+        """All scenes, each a little off; the same differences whenever the number is the same.
+
+        An approximation: turns, heights and the parts of bodies of several parts stay.
+
+        Args:
+          scenes: as NumPy arrays.
+          number: 1 or more; 0 changes nothing.
+        """
+        if number == 0:
+            return scenes
+        rng, level = np.random.default_rng([SEED, number]), np.float32([1.0, 1.0, 0.0])
+        objects = scenes.objects
+        slots = objects.position.shape[1:]
+        position = objects.position + np.float32(rng.normal(0.0, self.place, slots)) * level
+        size = objects.size * (1 + np.float32(rng.normal(0.0, self.size, slots)) * level)
+        pose = scenes.pose + np.append(np.float32(rng.normal(0.0, self.place, 2)), np.float32(0.0))
+        return scenes.replace(objects=objects.replace(position=position, size=size), pose=pose)
+
+
+class ScenesNear(Generic[Scene]):
+    """A scene, by the number 0, and those near it, each made when first needed, by one thread.
+
+    Args:
+      make: makes the scene of a number.
+    """
+
+    def __init__(self, make: Callable[[int], Scene]) -> None:
+        self._make, self._lock = make, threading.Lock()
+        self._made: dict[int, Scene] = {}
+
+    def __getitem__(self, number: int) -> Scene:
+        with self._lock:
+            if number not in self._made:
+                self._made[number] = self._make(number)
+            return self._made[number]
