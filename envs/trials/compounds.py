@@ -15,11 +15,15 @@ from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents, inertial
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
 from mechsearch_jax.workspace.scenario import Body
 
 # A round superquadric whose exponent e1 is above this is nearer to an ellipsoid than to a cylinder.
 SMOOTH_EXPONENT = 0.6
+# Bodies of several parts are none of the environment's boxes and cylinders. What they are made of is not known: here
+# they are as dense as full vessels [kg/m3] and of the roughest material, since what is heavier or rougher than in its
+# trial holds the arm up.
+DENSITY, FRICTION = 1000.0, 0.6
 
 
 def _piece(size: np.ndarray, exponents: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> Piece:
@@ -35,7 +39,7 @@ def _piece(size: np.ndarray, exponents: np.ndarray, position: np.ndarray, rotati
 
 
 def compound_of(parts: Any) -> Compound:
-    """The compound of a body's parts, in the body's frame; as dense and rough as the environment's boxes and cylinders.
+    """The compound of a body's parts, in the body's frame, of `DENSITY` and `FRICTION`.
 
     Args:
       parts: a `Superquadrics` of a single body, as NumPy arrays; absent ones are left out.
@@ -43,10 +47,7 @@ def compound_of(parts: Any) -> Compound:
     there = np.flatnonzero(parts.valid)
     rows = [(parts.size[i], parts.exponents[i], parts.position[i], parts.rotation[i]) for i in there]
     pieces = tuple(_piece(*row) for row in rows)
-    shapes = [shape_of("box" if piece.shape == "box" else "cylinder") for piece in pieces]
-    volumes = [inertial(Compound((piece,), 1.0, 0.0)).mass for piece in pieces]
-    density = float(np.average([shape.density for shape in shapes], weights=volumes))
-    return Compound(pieces, density, max(shape.friction for shape in shapes))
+    return Compound(pieces, DENSITY, FRICTION)
 
 
 def with_parts(
