@@ -295,4 +295,4 @@ def test_a_gallery_is_drawn_of_the_recordings_that_are_there(tmp_path, monkeypat
     monkeypatch.setattr(gallery.subprocess, "run", lambda program: types.SimpleNamespace(returncode=3))
     with pytest.raises(SystemExit):
         gallery.main(["crowded", "--out", str(tmp_path)])
-    assert "mechsearch search crowded-shelf --horizon 3" in capsys.readouterr().err
+    assert "mechsearch search crowded-shelf --out" in capsys.readouterr().err

@@ -24,6 +24,7 @@ from recordings import (
     stacked,
     step,
 )
+from scipy.spatial.transform import Rotation
 from stage import HIDDEN
 
 from mechsearch_jax.actions import no_action
@@ -31,11 +32,11 @@ from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.numbering import named_tried
 from mechsearch_jax.envs.episode.protocols import REACHED
 from mechsearch_jax.envs.episode.records import record_action, save_episode
-from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets, objects_in_words
 from mechsearch_jax.envs.page import page as pages
 from mechsearch_jax.envs.page.ending import ending, executed_words, plain
 from mechsearch_jax.envs.page.page import RECORD, page, recording_with_record
-from mechsearch_jax.envs.page.pictures import hidden_behind, last_world
+from mechsearch_jax.envs.page.pictures import Painter, hidden_behind, last_world, tried_grasp
 from mechsearch_jax.envs.page.steps import candidates, shapes
 from mechsearch_jax.envs.recording.evidence import Forecasts, foreseen_rows
 from mechsearch_jax.envs.recording.narration import verdict
@@ -119,16 +120,50 @@ def test_the_card_says_why_the_target_was_lost(text):
     assert "Lost: found, but not graspable" in sentences
     assert "The target was seen after 1 action. The only action that an episode may have was used up" in sentences
     # The second grasp hits more than the first.
-    assert "each of the 2 grasps that arm and shelf allow hits object 0." in sentences
+    assert "each of the 2 grasps that arm and shelf allow hits object 0; the target’s middle is" in sentences
     assert "Orange: in the way" in sentences
     assert "J was to fall by 40 in all, and fell by 5" in sentences
     assert "actions 1 of at most 1" in sentences
 
 
+def test_a_target_that_was_taken_out_is_explained_in_the_picture(text):
+    said = "Red: the target, held in front of the shelf."
+    won = dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, retrieved=True, failure=None))
+    assert said in words(page(won))
+    assert said not in words(text)
+
+
+def test_captions_name_only_what_a_picture_shows(text):
+    first, last = text.split('<section class="step"')[1:]
+    assert "and the action (hand dark" in words(first)
+    assert "since the step before" not in words(first)
+    assert "What the camera saw." in words(last)
+    assert "and the action (hand dark" not in words(last)
+    assert "Red: the target. Orange outline" in words(last)
+    taken = dataclasses.replace(STEPS[1], action=RETRIEVAL)
+    _, last = page(dataclasses.replace(LOST, steps=(STEPS[0], taken))).split('<section class="step"')[1:]
+    assert "(hand dark; red, dashed: the target on its way out)" in words(last)
+    assert "blue dashed" not in words(last)
+
+
+@pytest.mark.parametrize(("gone", "opened"), [(False, False), (True, False), (True, True)])
+def test_captions_name_poses_that_changed_only_where_some_did(gone, opened):
+    before = np.arange(POSES) % 2 == 0
+    now = before.copy()
+    now[0], now[1] = not gone, opened
+    steps = [
+        dataclasses.replace(step, found=False, evidence=evidence(), existence=existence)
+        for step, existence in zip(STEPS, (before, now), strict=True)
+    ]
+    _, last = page(dataclasses.replace(LOST, steps=tuple(steps))).split('<section class="step"')[1:]
+    assert ("Grey crosses: ruled out" in words(last)) == gone
+    assert ("Blue crosses: opened again" in words(last)) == opened
+
+
 def test_a_step_shows_the_decision_beside_the_runner_up(text):
     sentences = words(text)
     assert "chosen: push object 0 by 10 cm" in sentences
-    assert "runner-up: push object 0 by 20 cm" in sentences
+    assert "runner-up, refused after its trial: push object 0 by 20 cm" in sentences
     assert f"Predicted: f at {POSES} poses, graspable at {POSES}, J 90. Its sequence changes J by -30.0" in sentences
     assert "J: 100 before, 60 expected, 95 observed. It came out worse than expected." in sentences
 
@@ -161,6 +196,9 @@ def test_the_best_candidate_that_moves_another_object_is_shown_and_foreseen():
     assert shown[2].words.startswith("push object 2")
     two = dataclasses.replace(chosen, sampled=of_objects(0, 2))
     assert [c.role for c in candidates(two)] == ["chosen", "runner-up"]
+    tried = TriedActions(stacked(two.sampled.single(1)), np.array([TrialResult.FAILED], np.int32))
+    failed = dataclasses.replace(two, evidence=dataclasses.replace(two.evidence, tried=tried))
+    assert [c.role for c in candidates(failed)] == ["chosen", "runner-up, passed over after its trial"]
 
 
 def test_forecasts_of_an_earlier_version_are_of_the_best_candidates(tmp_path):
@@ -255,6 +293,10 @@ def test_endings_name_what_happened():
     missed = of("retrieval: missed", (EPISODE.steps[0], record(RETRIEVAL, found=True)), (STEPS[0], taking))
     assert missed.title == "Lost: the hand missed the target"
     assert missed.sentences[0] == "The target was to be taken out by action 2, but the hand missed the target."
+    # The first step's trace moves object 0.
+    moving = dataclasses.replace(taking, trace=STEPS[0].trace)
+    missed = of("retrieval: missed", (EPISODE.steps[0], record(RETRIEVAL, found=True)), (STEPS[0], moving))
+    assert missed.sentences[0].endswith("the hand missed the target. Object 0 moved meanwhile.")
     won = ending(dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, retrieved=True, failure=None)))
     assert won.good
     assert not won.blockers
@@ -354,6 +396,128 @@ def test_the_objects_that_hide_the_target_are_named():
     gone = jax.tree.map(np.asarray, from_scenario(HIDDEN))
     gone = gone.replace(valid=np.arange(len(gone.valid)) == TARGET)
     assert hidden_behind(step("1  look", world=gone), RECORDING.camera, RECORDING.shelf) == []
+
+
+def test_an_action_that_moves_the_target_is_named():
+    def of(metres):
+        world = STEPS[1].world
+        position = np.array(world.position)
+        position[TARGET, 0] += metres
+        moved = dataclasses.replace(STEPS[1], world=world.replace(position=position))
+        return " ".join(ending(dataclasses.replace(LOST, steps=(STEPS[0], moved))).sentences)
+
+    assert re.search(r"Action 1, “push object 0 .*”, moved the target by 5 cm\.", of(0.05))
+    assert "moved the target" not in of(0.004)
+
+
+def test_objects_that_were_tipped_are_named_and_never_said_to_stand():
+    quarter = Rotation.from_euler("x", 90, degrees=True).as_matrix().astype(np.float32)
+
+    def of(turn, **changes):
+        """The sentences of an episode whose first action turned object 0."""
+        world = STEPS[1].world
+        rotation = np.array(world.rotation)
+        rotation[0] = turn @ rotation[0]
+        episode = dataclasses.replace(EPISODE, **changes)
+        turned = dataclasses.replace(STEPS[1], world=world.replace(rotation=rotation))
+        return " ".join(ending(dataclasses.replace(LOST, steps=(STEPS[0], turned), episode=episode)).sentences)
+
+    won = {"retrieved": True, "failure": None}
+    said = of(quarter, **won)
+    assert "no object fell off the board. On the board, action 1 tipped object 0." in said
+    assert "no object fell over or off the board." in of(np.eye(3, dtype=np.float32), **won)
+    yawed = Rotation.from_euler("z", 90, degrees=True).as_matrix().astype(np.float32)
+    assert "no object fell over or off the board." in of(yawed, **won)
+    assert "On the board, action 1 tipped object 0." in of(quarter)
+    # What fell off the board is no more on it.
+    off = (dataclasses.replace(EPISODE.steps[0], fallen=(0,)), EPISODE.steps[1])
+    assert "tipped" not in of(quarter, steps=off, failure="an object fell off the board at action 1")
+
+
+def test_a_target_that_no_grasp_reaches_is_said_to_be_near_a_wall():
+    world = STEPS[1].world
+    position = np.array(world.position)
+    position[TARGET, :2] = RECORDING.shelf.back - 0.02, 0.1
+    none = dataclasses.replace(evidence(found=True), hits=np.zeros((0, SLOTS), bool))
+    last = dataclasses.replace(STEPS[1], world=world.replace(position=position), evidence=none)
+    said = " ".join(ending(dataclasses.replace(LOST, steps=(STEPS[0], last))).sentences)
+    assert "arm and shelf allow no grasp of the target; the target’s middle is 2.0 cm from the back wall." in said
+    position[TARGET, :2] = 0.6, RECORDING.shelf.left - 0.03
+    last = dataclasses.replace(last, world=world.replace(position=position))
+    said = " ".join(ending(dataclasses.replace(LOST, steps=(STEPS[0], last))).sentences)
+    assert "3.0 cm from a side wall." in said
+
+
+def test_a_target_that_lies_at_the_end_is_explained_in_the_pictures():
+    def of(**changes):
+        """What is said of an episode at whose end the target lies, alone on the board."""
+        world = STEPS[1].world
+        rotation = np.array(world.rotation)
+        rotation[TARGET] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+        lying = world.replace(rotation=rotation, valid=np.arange(len(world.valid)) == TARGET)
+        episode = dataclasses.replace(EPISODE, **changes)
+        last = dataclasses.replace(STEPS[1], world=lying)
+        return words(page(dataclasses.replace(LOST, steps=(STEPS[0], last), episode=episode)))
+
+    lies = of(failure="the target fell over")
+    assert "Red: the target, which no longer stands." in lies
+    assert "The target, which no longer stands, is not drawn." in lies
+    assert "no longer stands" not in of(retrieved=True, failure=None)
+    assert "no longer stands" not in words(page(LOST))
+
+
+def test_where_no_candidate_promises_anything_the_card_says_so():
+    def of(value, cost=2.0):
+        kept = STEPS[1].sampled if len(STEPS[1].sampled) else STEPS[0].sampled
+        flat = dataclasses.replace(kept, value=np.full(len(kept), value), cost=np.full(len(kept), cost))
+        last = dataclasses.replace(STEPS[1], sampled=flat, evidence=evidence(found=True))
+        return ending(dataclasses.replace(LOST, steps=(STEPS[0], last))).sentences
+
+    said = "No candidate since it was seen was expected to lower J."
+    assert of(-0.01)[-1] == said
+    assert said not in of(-1.0)
+    # A policy that minds no cost.
+    assert said not in of(0.0, 0.0)
+
+
+def test_a_policy_that_minds_no_cost_is_shown_none():
+    kept = STEPS[0].sampled
+    flat = dataclasses.replace(kept, value=np.zeros(len(kept)), cost=np.zeros(len(kept)))
+    steps = (dataclasses.replace(STEPS[0], sampled=flat), STEPS[1])
+    free = dataclasses.replace(EPISODE.steps[0], cost=0.0, predicted_cost=0.0, observed_cost=0.0)
+    episode = dataclasses.replace(EPISODE, steps=(free, EPISODE.steps[1]))
+    said = words(page(dataclasses.replace(LOST, steps=steps, episode=episode)))
+    assert f"Predicted: f at {POSES} poses, graspable at {POSES}." in said
+    assert "Cost." not in said
+    assert "changes J" not in said
+
+
+def test_a_cost_of_a_retrieval_is_explained():
+    taking = dataclasses.replace(STEPS[1], action=RETRIEVAL)
+    said = words(page(dataclasses.replace(LOST, steps=(STEPS[0], taking))))
+    assert "60 expected, 95 observed, as a grasp that takes the target out is known then" in said
+
+
+def test_the_hand_of_a_grasp_that_was_tried_is_drawn_where_the_search_ends():
+    tried = TriedActions(stacked(PUSH, RETRIEVAL), np.array([TrialResult.SUCCEEDED, TrialResult.FAILED], np.int32))
+    last = dataclasses.replace(STEPS[1], evidence=evidence(found=True, tried=tried))
+    np.testing.assert_array_equal(tried_grasp(last).T_world_gripper, RETRIEVAL.T_world_gripper)
+    assert tried_grasp(STEPS[1]) is None
+    assert tried_grasp(dataclasses.replace(last, action=PUSH)) is None
+    said = "Orange, dashed: the hand at the first grasp that was tried out in simulation."
+    assert words(page(dataclasses.replace(LOST, steps=(STEPS[0], last)))).count(said) == 2
+    assert said not in words(page(LOST))
+    recording = dataclasses.replace(LOST, steps=(STEPS[0], last))
+    drawn, plain_map = (Painter(r).end(()).above for r in (recording, LOST))
+    assert (drawn != plain_map).any()
+
+
+def test_objects_are_listed_as_in_a_sentence():
+    assert [objects_in_words(indices) for indices in ((3,), (1, 3), (1, 3, 5))] == [
+        "object 3",
+        "objects 1 and 3",
+        "objects 1, 3 and 5",
+    ]
 
 
 def test_the_last_state_is_that_after_the_last_action():

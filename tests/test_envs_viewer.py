@@ -160,7 +160,7 @@ def test_a_card_says_why_the_target_was_lost_and_what_blocks_it(another_server):
     assert "Lost: found, but not graspable" in lost.ended
     lost.show(0)
     assert "J: 100 before, 60 expected, 95 observed" in lost.text
-    assert "runner-up: push object 0 by 20 cm" in lost.evidence
+    assert "runner-up, refused after its trial: push object 0 by 20 cm" in lost.evidence
     assert "harm: something fell off the board" in lost.evidence
     assert "refused" in lost.evidence
     assert "90 %" in lost.evidence

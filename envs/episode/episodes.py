@@ -7,11 +7,11 @@ and accepts a watcher.
 
 An episode gets three verdicts, all on the true state: `graspable` (the target is found and a collision-free grasp
 exists), `paper_graspable` (a collision-free one among the paper's grasps) and `retrieved` (the hand took it out of the
-shelf, and no object fell, neither then nor before). A retrieval does not imply `graspable`: a grasp that touches
-something may succeed where no collision-free one exists. An action that fails costs a step and leaves the world as it
-made it. Once an object has left the board no retrieval counts: the episode continues until the target is found and
-graspable, or the policy decides on a retrieval, which is not executed. An episode ends with its retrieval, graspable or
-not, and does not continue for the sake of `paper_graspable`.
+shelf, and no object fell off the board, neither then nor before). A retrieval does not imply `graspable`: a grasp that
+touches something may succeed where no collision-free one exists. An action that fails costs a step and leaves the world
+as it made it. Once an object has left the board no retrieval counts: the episode continues until the target is found
+and graspable, or the policy decides on a retrieval, which is not executed. An episode ends with its retrieval,
+graspable or not, and does not continue for the sake of `paper_graspable`.
 """
 
 from __future__ import annotations

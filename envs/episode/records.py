@@ -115,7 +115,8 @@ class Episode:
       steps: one for each observation.
       found_step: number of actions before the target was found; None where it never was.
       graspable_step: number of actions before the first `graspable` step, retrieved or not; None if there was none.
-      retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
+      retrieved: whether the hand took the target out of the shelf and no object fell off the board, neither then nor
+        before.
       failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
         reason, with the number of the action.
       content_hash: of the scenario, see `Scenario.content_hash`.

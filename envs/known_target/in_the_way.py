@@ -39,4 +39,5 @@ def grasps_in_words(hits: Bool[np.ndarray, "grasps n"]) -> str:
 
 def objects_in_words(indices: Sequence[int]) -> str:
     """Objects by their numbers."""
-    return ("object " if len(indices) == 1 else "objects ") + " and ".join(map(str, indices))
+    *others, last = map(str, indices)
+    return f"objects {', '.join(others)} and {last}" if others else f"object {last}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,11 +14,14 @@ from mechsearch_jax.actions import KINDS, Action, kind_of
 from mechsearch_jax.envs.episode.protocols import REACHED
 from mechsearch_jax.envs.episode.records import ActionRecord, Episode
 from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, objects_in_words
-from mechsearch_jax.envs.page.pictures import hidden_behind, target_pixels
+from mechsearch_jax.envs.page.pictures import hidden_behind, last_world, target_pixels
+from mechsearch_jax.envs.pushing.pushes import toppled
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
+from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.workspace.detector import found_pixels
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Failures of retrievals in the words of a page, and of other actions.
 _RETRIEVAL = {
@@ -33,6 +37,10 @@ _ACTION = {
 }
 # Objects that hide a smaller share of the target are not named.
 LEAST_SHARE = 0.05
+# What moved less at an action counts as where it was [m].
+DISPLACED = 0.01
+# A candidate that lowers J by less promises nothing.
+LEAST_GAIN = 0.05
 # Objects in the way whose moves are counted, at most.
 MOST_NAMED = 3
 
@@ -60,15 +68,17 @@ def ending(recording: Recording) -> Ending:
         heading = recording.heading.partition(": ")[2] or recording.heading
         return Ending(None, heading, _believed(recording, last), _blockers(last))
     if episode.retrieved:
-        taken = f"{_seen(episode)} and taken out of the shelf by action {len(episode.steps)}; no object fell."
-        return Ending(True, "Retrieved", [taken], ())
+        tipped = _tipped(recording)
+        fell = "off the board" if tipped else "over or off the board"
+        taken = f"{_seen(episode)} and taken out of the shelf by action {len(episode.steps)}; no object fell {fell}."
+        return Ending(True, "Retrieved", [taken, *tipped], ())
     if episode.failure == REACHED:
         reached = f"{_seen(episode)}, and a grasp of it is free. The protocol of the published code ends here"
         return Ending(True, "Graspable", [f"{reached}: nothing is taken out."], ())
     failure = plain(episode.failure or "not retrieved")
-    sentences = [_what_happened(recording, episode)]
+    sentences = [_what_happened(recording, episode), *_tipped(recording)]
     if _is_open(failure):
-        sentences += [*_believed(recording, last), *_moves_of(recording, last)]
+        sentences += [*_displaced(recording), *_believed(recording, last), *_moves_of(recording, last)]
     elif not episode.found_step and not last.found:
         sentences += _belief_in_words(recording, last)
     return Ending(False, f"Lost: {failure}", sentences, _blockers(last) if _is_open(failure) else ())
@@ -109,13 +119,13 @@ def _what_happened(recording: Recording, episode: Episode) -> str:
     if fatal is None:
         return f"The episode ended: {failure or 'nothing says why'}."
     words = f"action {fatal + 1}, “{executed_words(recording, fatal)}”"
-    fallen = episode.steps[fatal].fallen or ()
+    fallen, more = episode.steps[fatal].fallen or (), _moved_meanwhile(recording, fatal) + _warned(recording, fatal)
     if failure.startswith("retrieval: ") and not fallen:
-        return f"The target was to be taken out by action {fatal + 1}, but {plain(failure)}.{_warned(recording, fatal)}"
+        return f"The target was to be taken out by action {fatal + 1}, but {plain(failure)}.{more}"
     if fallen:
-        return f"{objects_in_words(fallen).capitalize()} fell off the board at {words}.{_warned(recording, fatal)}"
+        return f"{objects_in_words(fallen).capitalize()} fell off the board at {words}.{more}"
     if "the target fell" in failure:
-        return f"{failure.capitalize()} at {words}.{_warned(recording, fatal)}"
+        return f"{failure.capitalize()} at {words}.{more}"
     return f"The episode ended after {words}: {failure}."
 
 
@@ -133,6 +143,16 @@ def _fatal(episode: Episode, acts: list[int]) -> int | None:
     return fell[0] if fell else acts[-1] if acts else None
 
 
+def _moved_meanwhile(recording: Recording, i: int) -> str:
+    """Which objects moved while the target was to be taken out; empty at other actions, or where none did."""
+    step = recording.steps[i]
+    if not takes_target(step) or not len(step.trace.time):
+        return ""
+    shifts = np.linalg.norm(np.asarray(step.trace.position)[:, :TARGET] - step.world.position[:TARGET], axis=-1)
+    moved = np.flatnonzero((shifts.max(axis=0) > DISPLACED) & step.world.valid[:TARGET]).tolist()
+    return f" {objects_in_words(moved).capitalize()} moved meanwhile." if moved else ""
+
+
 def _warned(recording: Recording, i: int) -> str:
     """Whether trials had shown that an action would do harm."""
     step = recording.steps[i]
@@ -142,10 +162,11 @@ def _warned(recording: Recording, i: int) -> str:
         or executed_words(recording, i) != action_words(step)
     ):
         return ""
-    result = chosen_result(step)
+    result = trial_of(step, step.action)
     hidden = " The target was hidden then, and a trial knows nothing of what is hidden." if not step.found else ""
-    if result is TrialResult.SUCCEEDED and _takes(step):
-        touched = " It touches objects on its way." if not free(step.evidence.hits) else ""
+    if result is TrialResult.SUCCEEDED and takes_target(step):
+        hits = step.evidence.hits
+        touched = "" if free(hits) else f" It touches objects on its way: {grasps_in_words(hits)}."
         return f" In its trial this grasp had taken the target out.{touched}"
     if result is TrialResult.SUCCEEDED:
         return f" It had been tried out beforehand and did no harm in the trial.{hidden}"
@@ -154,29 +175,60 @@ def _warned(recording: Recording, i: int) -> str:
     return ""
 
 
-def chosen_result(step: RecordedStep) -> TrialResult | None:
-    """What the trial of a step's action came to; None if it was not tried."""
-    if step.evidence is None or step.action is None:
+def trial_of(step: RecordedStep, action: Action | None) -> TrialResult | None:
+    """What the trial of an action came to at a step; None if it was not tried."""
+    if step.evidence is None or action is None:
         return None
     tried = step.evidence.tried
     for k in range(len(tried.result)):
-        if same_action(step, tried.action, k):
+        if _same_motion(action, jax.tree.map(lambda a, k=k: a[k], tried.action)):
             return TrialResult(int(tried.result[k]))
     return None
 
 
 def same_action(step: RecordedStep, actions: Action, k: int) -> bool:
     """Whether the k-th of many actions is the one that the step decided on."""
-    return step.action is not None and _alike(step.action, jax.tree.map(lambda a: a[k], actions))
+    return step.action is not None and _same_motion(step.action, jax.tree.map(lambda a: a[k], actions))
 
 
-def _alike(action: Action | ActionRecord, other: Action) -> bool:
+def _same_motion(action: Action | ActionRecord, other: Action) -> bool:
     """Whether two actions are the same motion."""
     kind = action.kind if isinstance(action.kind, str) else kind_of(int(action.kind)).name
     names = ("T_world_gripper", "T_world_place", "displacement", "q7")
     return kind == kind_of(int(other.kind)).name and all(
         np.allclose(getattr(action, name), getattr(other, name), atol=1e-6) for name in names
     )
+
+
+def _displaced(recording: Recording) -> list[str]:
+    """Which action that was to move something else moved the target most, and how far; empty if none did."""
+    moved = [
+        float(np.linalg.norm(np.asarray(then.position)[TARGET] - np.asarray(step.world.position)[TARGET]))
+        if step.action is not None and _moves(step.action)
+        else 0.0
+        for step, then in zip(recording.steps, _worlds_after(recording), strict=True)
+    ]
+    i = int(np.argmax(moved))
+    if moved[i] < DISPLACED:
+        return []
+    return [f"Action {i + 1}, “{executed_words(recording, i)}”, moved the target by {100 * moved[i]:.0f} cm."]
+
+
+def _tipped(recording: Recording) -> list[str]:
+    """Which actions tipped which objects that stay on the board; empty if none did."""
+    records = () if recording.episode is None else recording.episode.steps
+    off = [i for record in records for i in record.fallen or ()]
+    tips = []
+    for i, (step, then) in enumerate(zip(recording.steps, _worlds_after(recording), strict=True)):
+        over = np.asarray(toppled(step.world, then))[:TARGET]
+        if objects := [k for k in np.flatnonzero(over).tolist() if k not in off]:
+            tips.append(f"action {i + 1} tipped {objects_in_words(objects)}")
+    return [f"On the board, {', '.join(tips)}."] if tips else []
+
+
+def _worlds_after(recording: Recording) -> list[World]:
+    """The true state after each step."""
+    return [*(step.world for step in recording.steps[1:]), last_world(recording.steps[-1])]
 
 
 def _believed(recording: Recording, step: RecordedStep) -> list[str]:
@@ -187,7 +239,16 @@ def _believed(recording: Recording, step: RecordedStep) -> list[str]:
         return [*sentences, "Which objects its grasps meet was not recorded."]
     if free(hits):
         return [*sentences, "At the last look a grasp of it would have hit nothing."]
-    return [*sentences, f"At the last look {grasps_in_words(hits)}."]
+    where = f"; {_at_wall(recording.shelf, step)}" if step.found else ""
+    return [*sentences, f"At the last look {grasps_in_words(hits)}{where}."]
+
+
+def _at_wall(shelf: Shelf, step: RecordedStep) -> str:
+    """How far the target truly is from the nearest wall, in words."""
+    x, y, _ = np.asarray(step.world.position)[TARGET]
+    walls = {"the back wall": shelf.back - x, "a side wall": min(shelf.left - y, y - shelf.right)}
+    nearest = min(walls, key=lambda wall: walls[wall])
+    return f"the target’s middle is {100 * walls[nearest]:.1f} cm from {nearest}"
 
 
 def _moves_of(recording: Recording, last: RecordedStep) -> list[str]:
@@ -202,7 +263,15 @@ def _moves_of(recording: Recording, last: RecordedStep) -> list[str]:
     if not considered:
         return []
     when = " since it was seen" if last.found else ""
-    return [_moves_in_words(i, considered, made, when) for i in objects[:MOST_NAMED]]
+    return [*(_moves_in_words(i, considered, made, when) for i in objects[:MOST_NAMED]), *_hopeless(since, last.found)]
+
+
+def _hopeless(steps: Sequence[RecordedStep], found: bool) -> list[str]:
+    """That since the target was found no candidate promised anything; empty if one did, or if no cost is minded."""
+    value, cost = (np.concatenate([getattr(step.sampled, name) for step in steps]) for name in ("value", "cost"))
+    if not found or not cost.any() or value.min() < -LEAST_GAIN:
+        return []
+    return ["No candidate since it was seen was expected to lower J."]
 
 
 def _moves_in_words(i: int, considered: list[tuple[int, bool]], made: list[int], when: str) -> str:
@@ -242,9 +311,9 @@ def _candidates(step: RecordedStep) -> list[tuple[int, bool]]:
         if result <= TrialResult.HARMFUL and _moves(action)
     ]
     left = [step.sampled.single(k) for k in range(len(step.sampled))]
-    if _takes(step):
+    if takes_target(step):
         # A retrieval leaves the sequences as they are, refused ones among them.
-        return [(int(action.object), any(_alike(action, other) for other in refused)) for action in left]
+        return [(int(action.object), any(_same_motion(action, other) for other in refused)) for action in left]
     return [(int(action.object), False) for action in left] + [(int(action.object), True) for action in refused]
 
 
@@ -253,7 +322,8 @@ def _moves(action: Action) -> bool:
     return kind_of(int(action.kind)).moves_object
 
 
-def _takes(step: RecordedStep) -> bool:
+def takes_target(step: RecordedStep) -> bool:
+    """Whether a step's action is to take the target out."""
     return step.action is not None and kind_of(int(step.action.kind)).takes_target
 
 
@@ -307,7 +377,7 @@ def executed_words(recording: Recording, i: int) -> str:
     """The action that a step executed, in words; the protocol of the published code may replace the decided one."""
     step = recording.steps[i]
     record = None if recording.episode is None else recording.episode.steps[i].action
-    if record is None or step.action is None or _alike(record, step.action):
+    if record is None or step.action is None or _same_motion(record, step.action):
         return action_words(step)
     kinds = {kind.name: kind for kind in KINDS.values()}
     fields: dict[str, Any] = {f.name: np.asarray(getattr(record, f.name)) for f in dataclasses.fields(ActionRecord)[2:]}

@@ -15,8 +15,8 @@ import jinja2
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.episode.records import load_episode
 from mechsearch_jax.envs.page import steps as texts
-from mechsearch_jax.envs.page.ending import action_words, ending, executed_words
-from mechsearch_jax.envs.page.pictures import Painter, data_uri
+from mechsearch_jax.envs.page.ending import action_words, ending, executed_words, takes_target
+from mechsearch_jax.envs.page.pictures import Painter, changed_cells, data_uri, tried_grasp
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
@@ -119,6 +119,9 @@ def _card(recording: Recording, painter: Painter) -> dict[str, Any]:
     return {
         **end._asdict(),
         "stands": last.stands,
+        "grasp": last.stands and tried_grasp(recording.steps[-1]) is not None,
+        "shows": last.shows,
+        "taken": recording.episode is not None and bool(recording.episode.retrieved),
         "facts": _facts(recording),
         "seen": data_uri(last.seen),
         "above": data_uri(last.above),
@@ -179,7 +182,9 @@ def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
             for candidate, picture in zip(words["candidates"], pictures, strict=True)
         ],
         "sampled": len(step.sampled),
-        "retrieves": step.action is not None and kind_of(int(step.action.kind)).takes_target,
+        "retrieves": takes_target(step),
+        "grasp": tried_grasp(step) is not None,
+        **_changes(recording, i),
         "recognised": data_uri(painter.recognised(step, frame, texts.confidence(step))) if words["shapes"] else None,
         **_counts(step),
     }
@@ -214,6 +219,15 @@ def step_words(recording: Recording, i: int, frame: Frame) -> dict[str, Any]:
         "costs": texts.costs(recording, i),
         "troubles": texts.troubles(record),
     }
+
+
+def _changes(recording: Recording, i: int) -> Mapping[str, bool]:
+    """Whether the map of a step marks poses that were ruled out since the step before, or opened again."""
+    step, before = recording.steps[i], recording.steps[i - 1] if i else None
+    if before is None or step.found or before.found:
+        return {"ruled_out": False, "opened": False}
+    gone, opened = changed_cells(recording.target, before.existence, step.existence)
+    return {"ruled_out": bool(gone.any()), "opened": bool(opened.any())}
 
 
 def _counts(step: RecordedStep) -> Mapping[str, int]:

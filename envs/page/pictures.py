@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.recording.pictures import colour_image
@@ -50,12 +51,14 @@ class End(NamedTuple):
     Attributes:
       seen, above: in the camera's view and from above.
       stands: whether the target still stands on the board.
+      shows: whether the camera sees some of the target.
       blockers: the objects on the board that are marked as in its way.
     """
 
     seen: Picture
     above: Picture
     stands: bool
+    shows: bool
     blockers: tuple[int, ...]
 
 
@@ -112,6 +115,7 @@ class Painter:
                 self._changes(axes, before.existence, step.existence)
             mark_from_above(axes, step.scene, blockers)
             flat = sketches.from_above
+            _draw_tried_grasp(axes, step)
             sketches.draw_action(axes, flat, frame.sketch, step.scene, step.after, self._shelf)
             if is_known(step.target_pose):
                 sketches.draw_taken_target(axes, flat, frame.sketch, step.target_pose, self._target, self._shelf)
@@ -162,9 +166,10 @@ class Painter:
             drawing.draw_objects(axes, scene)
             if pose is not None:
                 drawing.draw_target(axes, pose, self._target, certain=True)
+                _draw_tried_grasp(axes, self._recording.steps[-1])
             mark_from_above(axes, scene, blockers)
 
-        return End(self._view(seen), self._above(above), stands, blockers)
+        return End(self._view(seen), self._above(above), stands, bool((owner == TARGET).any()), blockers)
 
     def _map(
         self,
@@ -183,9 +188,9 @@ class Painter:
     def _changes(self, axes: Axes, before: Bool[np.ndarray, " x"], now: Bool[np.ndarray, " x"]) -> None:
         """Mark the cells in which the target could be before and no more, or the other way round."""
         rows, columns = self._target.grid
-        was, stays = (a.reshape(rows, columns, -1).any(axis=-1).ravel() for a in (before, now))
         places = self._target.candidate_poses(self._shelf).reshape(rows * columns, -1, 3)[:, 0, :2]
-        for cells, colour, mark in ((was & ~stays, RULED_OUT, "x"), (stays & ~was, REOPENED, "+")):
+        gone, opened = changed_cells(self._target, before, now)
+        for cells, colour, mark in ((gone, RULED_OUT, "x"), (opened, REOPENED, "+")):
             x, y = places[cells].T
             axes.scatter(y, x, s=11, c=colour, marker=mark, linewidths=1.0, zorder=2)
 
@@ -197,9 +202,37 @@ class Painter:
         return _drawn(drawing.map_share(self._shelf), draw)
 
 
+def changed_cells(
+    target: Target, before: Bool[np.ndarray, " x"], now: Bool[np.ndarray, " x"]
+) -> tuple[Bool[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
+    """The cells of the grid in which the target could be before and no more, and those opened again."""
+    rows, columns = target.grid
+    was, stays = (a.reshape(rows * columns, -1).any(axis=-1) for a in (before, now))
+    return np.asarray(was & ~stays), np.asarray(stays & ~was)
+
+
 def colour_of(sure: float) -> str:
     """The colour of a recognised shape by how sure recognition is; blue where nothing says so."""
     return drawing.TARGET if sure < DOUBTFUL else drawing.BLOCKED[1] if sure < SURE else drawing.ACTION
+
+
+def tried_grasp(step: RecordedStep) -> Action | None:
+    """The first grasp of the target that was tried out at a step without an action; None without one.
+
+    Beside the hand of an action it would be hard to see.
+    """
+    if step.evidence is None or step.action is not None:
+        return None
+    tried = step.evidence.tried.action
+    rows = [k for k, kind in enumerate(np.asarray(tried.kind).tolist()) if kind_of(kind).takes_target]
+    return jax.tree.map(lambda a: a[rows[0]], tried) if rows else None
+
+
+def _draw_tried_grasp(axes: Axes, step: RecordedStep) -> None:
+    grasp = tried_grasp(step)
+    if grasp is not None:
+        T = np.asarray(grasp.T_world_gripper, float)
+        sketches.draw_grasp(axes, sketches.from_above, T, float(grasp.opening), drawing.BLOCKED[1])
 
 
 def is_known(target_pose: Float[np.ndarray, " 3"]) -> bool:

@@ -13,7 +13,16 @@ from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode.records import Step
 from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words
-from mechsearch_jax.envs.page.ending import action_words, believed_elsewhere, counted, free, plain, same_action
+from mechsearch_jax.envs.page.ending import (
+    action_words,
+    believed_elsewhere,
+    counted,
+    free,
+    plain,
+    same_action,
+    takes_target,
+    trial_of,
+)
 from mechsearch_jax.envs.page.pictures import objects_of
 from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
@@ -42,9 +51,9 @@ class Candidate(NamedTuple):
     """One of the best candidates of a decision.
 
     Attributes:
-      role: "chosen", "runner-up", or "best of another object".
+      role: "chosen", "runner-up", or "best of another object"; of one that its trial ruled out, with that.
       words: the action.
-      value, cost: equation 2 of its sequence, and predicted J after it.
+      value, cost: equation 2 of its sequence, and predicted J after it; empty if the policy minds no cost.
       belief: predicted f and g in words; empty if not recorded.
       row: its index among the sampled actions.
     """
@@ -125,13 +134,23 @@ def candidates(step: RecordedStep) -> list[Candidate]:
     elsewhere = [k for k in every if moved[k] != step.action.object][:1]
     further = [k for k in elsewhere if k not in others and _forecast(step, k)]
     roles = {"chosen": chosen, "runner-up": others, "best of another object": further}
-    return [_candidate(step, role, k) for role, rows in roles.items() for k in rows]
+    return [_candidate(step, role + _ruled_out(step, k), k) for role, rows in roles.items() for k in rows]
+
+
+def _ruled_out(step: RecordedStep, k: int) -> str:
+    """That a trial ruled a candidate out; empty if none did, or if it was chosen nevertheless."""
+    result = trial_of(step, step.sampled.single(k))
+    if result in (None, TrialResult.SUCCEEDED) or same_action(step, step.sampled.action, k):
+        return ""
+    return f", {'passed over' if result is TrialResult.FAILED else 'refused'} after its trial"
 
 
 def _candidate(step: RecordedStep, role: str, k: int) -> Candidate:
     action = step.sampled.single(k)
     words = kind_of(int(action.kind)).describe(action, step.scene.capacity)
     value, cost = (float(numbers[k]) for numbers in (step.sampled.value, step.sampled.cost))
+    if not (step.sampled.value.any() or step.sampled.cost.any()):
+        return Candidate(role, words, "", "", _forecast(step, k), k)
     return Candidate(role, words, f"{value + 0.0:+.1f}".replace("-0.0", "0.0"), number(cost), _forecast(step, k), k)
 
 
@@ -269,14 +288,19 @@ def depth_of(recording: Recording, step: RecordedStep) -> np.ndarray:
 def costs(recording: Recording, i: int) -> tuple[str, bool] | None:
     """J before a step's action, as expected after it and as observed, and whether it came out as much worse.
 
-    None where that is not recorded.
+    None where that is not recorded, or where the policy minds no cost.
     """
     if recording.episode is None or recording.steps[i].action is None:
         return None
     record = recording.episode.steps[i]
     if record.cost is None or record.predicted_cost is None:
         return None
+    if not (record.cost or record.predicted_cost or record.observed_cost):
+        # The policy minds no cost.
+        return None
     observed = "not observed" if record.observed_cost is None else f"{number(record.observed_cost)} observed"
+    if i + 1 < len(recording.steps) and takes_target(recording.steps[i + 1]):
+        observed += ", as a grasp that takes the target out is known then"
     worse = record.observed_cost is not None and record.observed_cost > record.predicted_cost + 0.1 * record.cost
     return f"J: {number(record.cost)} before, {number(record.predicted_cost)} expected, {observed}", worse
 
