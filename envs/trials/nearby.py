@@ -55,12 +55,12 @@ class Nearby:
         """
         if number == 0:
             return scenes
-        rng, level = np.random.default_rng([SEED, number]), np.float32([1.0, 1.0, 0.0])
+        rng, level = np.random.default_rng([SEED, number]), np.array([1.0, 1.0, 0.0], np.float32)
         objects = scenes.objects
         slots = objects.position.shape[1:]
         position = objects.position + np.float32(rng.normal(0.0, self.place, slots)) * level
         size = objects.size * (1 + np.float32(rng.normal(0.0, self.size, slots)) * level)
-        pose = scenes.pose + np.append(np.float32(rng.normal(0.0, self.place, 2)), np.float32(0.0))
+        pose = scenes.pose + np.append(rng.normal(0.0, self.place, 2), 0.0).astype(np.float32)
         return scenes.replace(objects=objects.replace(position=position, size=size), pose=pose)
 
 
