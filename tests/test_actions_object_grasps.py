@@ -27,7 +27,12 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF, GRIPPER, CONFIG = Shelf(), Gripper(), ObjectGraspConfig()
 MAX_YAW, WRISTS = np.pi / 4, 3
-GRASPS = jax.jit(lambda prints: object_grasps(SHELF, GRIPPER, prints, CONFIG, MAX_YAW, WRISTS))
+# Objects may be grasped from the side, too.
+WIDE = ObjectGraspConfig(max_yaw=np.pi / 2)
+GRASPS = {
+    config: jax.jit(lambda prints, config=config: object_grasps(SHELF, GRIPPER, prints, config, MAX_YAW, WRISTS))
+    for config in (CONFIG, WIDE)
+}
 
 
 def upright(half, exponents, yaw):
@@ -40,10 +45,10 @@ def upright(half, exponents, yaw):
     )
 
 
-def grasps_of(half, exponents, yaw):
+def grasps_of(half, exponents, yaw, config=CONFIG):
     """float64: tip centres relative to the object's centre (A, 3), rotations (A, 3, 3), and whether each fits (A,)."""
     scene = upright(half, exponents, yaw)
-    T, fits = GRASPS(footprints.footprints(scene))
+    T, fits = GRASPS[config](footprints.footprints(scene))
     T = np.asarray(T[0], np.float64)
     return T[:, :3, 3] - np.asarray(scene.position[0]), T[:, :3, :3], np.asarray(fits[0])
 
@@ -56,13 +61,14 @@ def corners(half, yaw):
 boxes = st.tuples(st.floats(0.01, 0.08), st.floats(0.01, 0.08), st.floats(0.03, 0.1))
 
 
+@pytest.mark.parametrize("config", [CONFIG, WIDE], ids=["front", "side"])
 @hypothesis.given(half=boxes, yaw=st.floats(-np.pi, np.pi))
 @hypothesis.settings(deadline=None, max_examples=60)
-def test_a_box_passes_between_the_open_fingers_and_stays_off_the_palm(half, yaw):
-    tips, R, fits = grasps_of(half, shape_of("box").exponents, yaw)
+def test_a_box_passes_between_the_open_fingers_and_stays_off_the_palm(config, half, yaw):
+    tips, R, fits = grasps_of(half, shape_of("box").exponents, yaw, config)
     for tip, rotation in zip(tips[fits], R[fits], strict=True):
         heading = rotation[:2, 2] / np.linalg.norm(rotation[:2, 2])
-        assert abs(np.arctan2(heading[1], heading[0])) <= MAX_YAW + 2e-3
+        assert abs(np.arctan2(heading[1], heading[0])) <= config.max_yaw + 2e-3
         across = corners(half, yaw) @ rotation[:2, 1]
         assert np.abs(across).max() <= 0.5 * GRIPPER.usable_opening + 1e-5
         # The palm is a plane PALM behind the tips; the corners at the height of the tips and below must be beyond it.
@@ -98,6 +104,44 @@ def test_a_turned_grasp_is_turned_towards_the_front_and_back_by_the_hand():
         held = rigid.in_hand(scene, jnp.int32(0), transforms.make(jnp.float32(rotation), jnp.zeros(3)))
         alignment = np.abs(np.asarray(held)[:2, :2].T @ rotation[:2, 1])
         np.testing.assert_allclose(np.sort(alignment), [0, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("yaw", [-0.2, 0.0, 0.1])
+def test_a_box_that_stands_across_is_grasped_from_the_side_alone(yaw):
+    half, box = (0.022, 0.078, 0.096), shape_of("box").exponents
+    _, _, fits = grasps_of(half, box, yaw)
+    assert not fits.any()
+    tips, R, fits = grasps_of(half, box, yaw, WIDE)
+    square = (grasp_variants(WIDE, WRISTS)[0] == 0) & fits
+    headings = np.arctan2(R[:, 1, 2], R[:, 0, 2])
+    # Of its two narrow sides the one that faces the robot more.
+    assert square.any()
+    assert np.ptp(headings[square]) < 1e-5
+    assert (np.abs(headings[fits]) <= np.pi / 2 + 2e-3).all()
+    # The hand stands beside the box, at the end that it approaches.
+    assert (np.sign(tips[fits, 1]) == -np.sign(headings[fits])).all()
+    assert (np.abs(tips[fits, 1]) > half[1] - PALM).all()
+
+
+@hypothesis.given(half=boxes, yaw=st.floats(-np.pi, np.pi))
+@hypothesis.settings(deadline=None, max_examples=60)
+def test_what_is_grasped_from_the_front_is_grasped_as_well_where_sides_are_allowed(half, yaw):
+    exponents = shape_of("box").exponents
+    front, side = (grasps_of(half, exponents, yaw, config) for config in (CONFIG, WIDE))
+    first = np.array([box.face == 0 for box in CONFIG.boxes])[grasp_variants(CONFIG, WRISTS)[0]]
+    # At 45 degrees two sides are equally square.
+    hypothesis.assume(abs(yaw % (np.pi / 2) - np.pi / 4) > 1e-3)
+    # The side that is the most square to the hand stays the first if it can be grasped.
+    both = first & front[2]
+    assert side[2][both].all()
+    for a, b in zip(front[:2], side[:2], strict=True):
+        np.testing.assert_allclose(a[both], b[both], atol=1e-6)
+
+
+@pytest.mark.parametrize("max_yaw", [0.0, -0.1, 1.7, np.nan])
+def test_approaches_from_behind_are_refused(max_yaw):
+    with pytest.raises(InputError, match="max_yaw"):
+        ObjectGraspConfig(max_yaw=max_yaw)
 
 
 def test_what_is_too_wide_for_the_hand_is_not_grasped():

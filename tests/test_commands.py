@@ -323,7 +323,7 @@ def test_what_is_given_goes_before_the_preset(preset):
 
 def test_actions_go_by_the_name_of_a_set():
     standard, paper = PRESETS["standard"]().options(), PRESETS["paper"]().options()
-    names = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
+    names = ("actions", "push_directions", "push_distances", "object_grasp_tilts", "object_grasp_max_yaw")
     of_paper = {name: paper[name] for name in names}
     assert of_paper != {name: standard[name] for name in names}
     assert options_of("--actions", "paper").settings().config == PRESETS["standard"](**of_paper)

@@ -97,6 +97,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "push_distances": [0.05, 0.1, 0.15],
         "avoid_unseen": True,
         "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
+        "object_grasp_max_yaw": pytest.approx(np.radians(45)),
         "criterion": "detector",
         "cell_reach": [1.0],
         "closer_look": 3,

@@ -96,7 +96,7 @@ PRESETS: Mapping[str, Callable[..., Config]] = {
 DEFAULT_PRESET = "standard"
 
 # The options that define the possible actions, not how they are chosen.
-ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
+ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts", "object_grasp_max_yaw")
 
 
 def action_set(name: str) -> dict[str, Any]:

@@ -22,6 +22,8 @@ PASSING_GAP = 0.003
 LOWEST = 0.025
 # Distance of the palm's flat front behind the finger tips' centres; the palm also extends as far above them [m].
 PALM = 0.033
+# From the back of the shelf no hand comes [rad].
+LARGEST_YAW = math.pi / 2 + 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +31,8 @@ class BoxGrasp:
     """A side grasp of an object with flat sides.
 
     Attributes:
-      face: the side that the gripper approaches: 0 is the most square to +x, 1 the next.
+      face: the side that the gripper approaches: 0 is the most square to +x, 1 the next. Sides that do not fit between
+        the fingers, or whose normal is farther from +x than `ObjectGraspConfig.max_yaw`, come last.
       turn: angle of the approach from square to that side, as a share of the largest possible one; positive towards +x.
         The object turns in the hand as the fingers close.
       drop: distance of the grasp below the object's top [m].
@@ -55,6 +58,8 @@ class ObjectGraspConfig:
       round_drops: distances of the grasp below a round object's top, used in turn over its approach directions, of
         which there are as many as `boxes` [m].
       tilts: angles by which the gripper points downwards [rad].
+      max_yaw: largest angle between the approach to a flat side and +x [rad]. A box that stands across in front of a
+        side wall can often be grasped from the open side alone.
       max_turn: largest angle between the approach and the normal of the grasped side [rad].
       min_turn: smaller angles are treated as square [rad].
       turn_gap: least free part of the opening when the approach is turned [m].
@@ -76,6 +81,10 @@ class ObjectGraspConfig:
         (math.radians(20), math.radians(30)),
         "angles by which the gripper points downwards as it grasps an object [rad]; the paper's is 0.35",
     )
+    max_yaw: float = option(
+        math.radians(45),
+        "largest angle between the approach to an object's flat side and straight into the shelf, at most 1.571 [rad]",
+    )
     max_turn: float = math.radians(22)
     min_turn: float = math.radians(5)
     turn_gap: float = 0.004
@@ -83,6 +92,10 @@ class ObjectGraspConfig:
     def __post_init__(self):
         if not (self.boxes and self.round_drops and self.tilts):
             raise InputError("ObjectGraspConfig: boxes, round_drops and tilts must each have at least one entry")
+        if not 0.0 < self.max_yaw <= LARGEST_YAW:
+            raise InputError(
+                f"ObjectGraspConfig: max_yaw {self.max_yaw} rad must be above 0 and at most {LARGEST_YAW:.4f}"
+            )
 
 
 def grasp_variants(config: ObjectGraspConfig, wrists: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -119,7 +132,7 @@ def object_grasps(
       gripper: the gripper.
       prints: the objects seen from above, leading axis N.
       config: static.
-      max_yaw: largest angle between the approach and +x [rad].
+      max_yaw: largest angle between the approach to a round object and +x [rad]; for flat sides see `config`.
       wrists: number of angles of joint 7.
 
     Returns:
@@ -135,7 +148,8 @@ def object_grasps(
 
     faces = prints.yaw[:, None] + QUARTER_TURN * jnp.arange(4)[None]
     faces = jnp.arctan2(jnp.sin(faces), jnp.cos(faces))
-    by_yaw = jnp.argsort(jnp.abs(faces), axis=1)
+    suits = jnp.tile(2 * prints.half[:, ::-1] <= gripper.usable_opening, 2) & (jnp.abs(faces) <= config.max_yaw)
+    by_yaw = jnp.argsort(jnp.abs(faces) + jnp.where(suits, 0.0, 2 * jnp.pi), axis=1)
     face = jnp.take_along_axis(by_yaw, jnp.broadcast_to(rank.astype(np.int32)[None], (n, a)), axis=1)
     square = jnp.take_along_axis(faces, face, axis=1)
     depth = jnp.where(face % 2 == 0, prints.half[:, :1], prints.half[:, 1:])
@@ -143,7 +157,7 @@ def object_grasps(
     turn = share[None] * _largest_turn(width, depth, gripper.usable_opening, config)
     directions = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
     yaw = jnp.where(is_round, jnp.float32(directions[box])[None], square - jnp.where(square < 0, -turn, turn))
-    fits = (2 * width <= gripper.usable_opening) & (jnp.abs(yaw) <= max_yaw + 1e-3)
+    fits = (2 * width <= gripper.usable_opening) & (jnp.abs(yaw) <= jnp.where(is_round, max_yaw, config.max_yaw) + 1e-3)
     fits &= is_round | (share == 0.0)[None] | (jnp.abs(turn) > config.min_turn)
     front = jnp.where(is_round, depth, depth * jnp.cos(turn) + width * jnp.abs(jnp.sin(turn)))
 
