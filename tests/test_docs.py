@@ -441,6 +441,21 @@ def test_what_came_of_fifty_searches_in_a_cell_is_what_is_stored():
     assert stored["config"] == read("benchmarks/parts/cells/other-cell.toml")
 
 
+def test_what_more_grasps_came_to_in_a_cell_is_what_is_stored():
+    before, after = (json.loads(read(f"benchmarks/results/cell-50{name}-cpu.json")) for name in ("", "-more-grasps"))
+    log = " ".join(read("docs/experiments.md").split())
+    taken = [{row["seed"] for row in stored["rows"] if row["retrieved"]} for stored in (before, after)]
+    low, high = after["summary"]["retrieved_interval"]
+    assert f"take {len(taken[1])} of {len(after['rows'])} out** ({low:.2f} to {high:.2f};" in log
+    assert taken[0] < taken[1]
+    *most, last = map(str, sorted(taken[1] - taken[0]))
+    assert f"{', '.join(most)} and {last}, and all {len(taken[0])} that were taken out before" in log
+    moved, failed = (sum(row[name] for row in after["rows"]) for name in ("motions", "failed"))
+    assert f"{failed} of {moved} motions failed" in log
+    assert after["conditions"] == before["conditions"]
+    assert after["config"] == read("benchmarks/parts/cells/other-cell-more-grasps.toml")
+
+
 def test_what_the_log_says_of_recognition_in_episodes_is_what_is_stored():
     log = " ".join(read("docs/experiments.md").split())
     masks, full = (run["episodes"] for run in stored_runs("rehearsal-recognition-cpu.json"))
