@@ -454,6 +454,11 @@ def test_what_more_grasps_came_to_in_a_cell_is_what_is_stored():
     assert f"{failed} of {moved} motions failed" in log
     assert after["conditions"] == before["conditions"]
     assert after["config"] == read("benchmarks/parts/cells/other-cell-more-grasps.toml")
+    ahead = json.loads(read("benchmarks/results/cell-50-three-ahead-cpu.json"))
+    assert ahead["config"] == after["config"] + "horizon = 3\n"
+    low, high = ahead["summary"]["retrieved_interval"]
+    assert f"**With `--horizon 3` as well, {ahead['summary']['retrieved']} of 50** ({low:.2f} to {high:.2f};" in log
+    assert taken[1] < {row["seed"] for row in ahead["rows"] if row["retrieved"]}
 
 
 def test_what_the_log_says_of_recognition_in_episodes_is_what_is_stored():
