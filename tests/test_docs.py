@@ -459,6 +459,12 @@ def test_what_more_grasps_came_to_in_a_cell_is_what_is_stored():
     low, high = ahead["summary"]["retrieved_interval"]
     assert f"**With `--horizon 3` as well, {ahead['summary']['retrieved']} of 50** ({low:.2f} to {high:.2f};" in log
     assert taken[1] < {row["seed"] for row in ahead["rows"] if row["retrieved"]}
+    assert ahead["config"] == read("benchmarks/parts/cells/other-cell-three-ahead.toml")
+    new = json.loads(read("benchmarks/results/cell-50-new-scenes-cpu.json"))
+    low, high = new["summary"]["retrieved_interval"]
+    assert f"On 50 new scenes {new['summary']['retrieved']} are taken out** ({low:.2f} to {high:.2f})" in log
+    assert f"None of {new['summary']['motions']} motions failed" in log
+    assert new["summary"]["failed_motions"] == 0
 
 
 def test_what_the_log_says_of_recognition_in_episodes_is_what_is_stored():

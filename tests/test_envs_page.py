@@ -449,12 +449,13 @@ def test_a_target_that_no_grasp_reaches_is_said_to_be_near_a_wall():
 
 
 def test_a_target_that_lies_at_the_end_is_explained_in_the_pictures():
-    def of(**changes):
-        """What is said of an episode at whose end the target lies, alone on the board."""
+    def of(x=0.6, **changes):
+        """What is said of an episode at whose end the target lies, alone on the board or in front of it."""
         world = STEPS[1].world
-        rotation = np.array(world.rotation)
+        rotation, position = np.array(world.rotation), np.array(world.position)
+        position[TARGET, 0] = x
         rotation[TARGET] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-        lying = world.replace(rotation=rotation, valid=np.arange(len(world.valid)) == TARGET)
+        lying = world.replace(rotation=rotation, position=position, valid=np.arange(len(world.valid)) == TARGET)
         episode = dataclasses.replace(EPISODE, **changes)
         last = dataclasses.replace(STEPS[1], world=lying)
         return words(page(dataclasses.replace(LOST, steps=(STEPS[0], last), episode=episode)))
@@ -463,6 +464,9 @@ def test_a_target_that_lies_at_the_end_is_explained_in_the_pictures():
     assert "Red: the target, which no longer stands." in lies
     assert "The target, which no longer stands, is not drawn." in lies
     assert "no longer stands" not in of(retrieved=True, failure=None)
+    out = of(x=RECORDING.shelf.front - 0.05, failure="retrieval: an object fell off the board at action 2")
+    assert "The target, outside the shelf, is not drawn." in out
+    assert "no longer stands" not in out
     assert "no longer stands" not in words(page(LOST))
 
 

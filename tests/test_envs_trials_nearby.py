@@ -1,6 +1,7 @@
 """Scenes near a recognised one: which differences are drawn, and that each scene is made once."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -52,8 +53,13 @@ def test_differences_are_as_large_as_they_are_said_to_be():
 @pytest.mark.parametrize("name", ["scenes", "place", "size"])
 def test_impossible_numbers_are_refused(name):
     for value in (-1, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=f"Nearby: {name} "):
+        with pytest.raises(InputError, match=f"Nearby: {name} .* must be finite and not negative"):
             Nearby(**{name: value})
+
+
+def test_the_number_of_scenes_is_whole():
+    with pytest.raises(InputError, match=r"Nearby: scenes 1\.5 must be a whole number"):
+        Nearby(scenes=1.5)
 
 
 def test_a_scene_is_made_once_by_whichever_thread_comes_first():
@@ -61,6 +67,7 @@ def test_a_scene_is_made_once_by_whichever_thread_comes_first():
 
     def make(number):
         made.append(number)
+        time.sleep(0.02)
         return None if number == 1 else f"scene {number}"
 
     near = ScenesNear(make)

@@ -168,9 +168,13 @@ def perception(stored: Stored) -> str:
 
 def _on_new_scenes(run: StoredRun, method: Method) -> list[Row]:
     """The rows with the method's settings on scenes that nothing was chosen on; a later option was as it is usually."""
-    settings = method.options()
+    settings, usual = method.options(), Method().options()
     rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
-    return [row for row in rows if all(options_of(row).get(name, value) == value for name, value in settings.items())]
+    return [
+        row
+        for row in rows
+        if all(options_of(row).get(name, usual.get(name)) == value for name, value in settings.items())
+    ]
 
 
 def _named(label: str, rows: Sequence[Row]) -> dict[str, list[Episode]]:

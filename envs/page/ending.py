@@ -166,7 +166,7 @@ def _warned(recording: Recording, i: int) -> str:
     hidden = " The target was hidden then, and a trial knows nothing of what is hidden." if not step.found else ""
     if result is TrialResult.SUCCEEDED and takes_target(step):
         hits = step.evidence.hits
-        touched = "" if free(hits) else f" It touches objects on its way: {grasps_in_words(hits)}."
+        touched = "" if free(hits) or not len(hits) else f" No grasp was free: {grasps_in_words(hits)}."
         return f" In its trial this grasp had taken the target out.{touched}"
     if result is TrialResult.SUCCEEDED:
         return f" It had been tried out beforehand and did no harm in the trial.{hidden}"
@@ -201,7 +201,7 @@ def _same_motion(action: Action | ActionRecord, other: Action) -> bool:
 
 
 def _displaced(recording: Recording) -> list[str]:
-    """Which action that was to move something else moved the target most, and how far; empty if none did."""
+    """Which action that was to move an object, or to push the target, moved the target most; empty if none did."""
     moved = [
         float(np.linalg.norm(np.asarray(then.position)[TARGET] - np.asarray(step.world.position)[TARGET]))
         if step.action is not None and _moves(step.action)
@@ -318,8 +318,13 @@ def _candidates(step: RecordedStep) -> list[tuple[int, bool]]:
 
 
 def _moves(action: Action) -> bool:
-    """Whether an action is to move an object that is not the target."""
+    """Whether an action is to move an object, or to push the target."""
     return kind_of(int(action.kind)).moves_object
+
+
+def target_is_out(recording: Recording) -> bool:
+    """Whether the target is in front of the shelf at the end."""
+    return bool(np.asarray(last_world(recording.steps[-1]).position)[TARGET, 0] < recording.shelf.front)
 
 
 def takes_target(step: RecordedStep) -> bool:

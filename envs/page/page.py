@@ -15,7 +15,7 @@ import jinja2
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.episode.records import load_episode
 from mechsearch_jax.envs.page import steps as texts
-from mechsearch_jax.envs.page.ending import action_words, ending, executed_words, takes_target
+from mechsearch_jax.envs.page.ending import action_words, ending, executed_words, takes_target, target_is_out
 from mechsearch_jax.envs.page.pictures import Painter, changed_cells, data_uri, tried_grasp
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.pictures import recorded_frame
@@ -121,6 +121,7 @@ def _card(recording: Recording, painter: Painter) -> dict[str, Any]:
         "stands": last.stands,
         "grasp": last.stands and tried_grasp(recording.steps[-1]) is not None,
         "shows": last.shows,
+        "fate": "outside the shelf" if target_is_out(recording) else "which no longer stands",
         "taken": recording.episode is not None and bool(recording.episode.retrieved),
         "facts": _facts(recording),
         "seen": data_uri(last.seen),

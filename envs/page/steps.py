@@ -192,7 +192,9 @@ def trials(step: RecordedStep) -> list[Trial]:
         verdict = "chosen" if made else "not better" if result is TrialResult.SUCCEEDED else passed
         colour, words = RESULTS[result]
         if kind.takes_target and result is not TrialResult.SUCCEEDED:
-            colour, words, verdict = "poor", "the target was not taken out", "passed over"
+            known = result is not TrialResult.UNKNOWN
+            words = "the target was not taken out, here or in a scene nearby" if known else "no result"
+            colour, verdict = "poor", "chosen" if made else "passed over"
         rows.append(Trial(kind.describe(single, step.scene.capacity), words, colour, verdict))
     # Grasps of the target are alike in words.
     alike = [(row, len(list(group))) for row, group in itertools.groupby(rows)]
@@ -299,7 +301,8 @@ def costs(recording: Recording, i: int) -> tuple[str, bool] | None:
         # The policy minds no cost.
         return None
     observed = "not observed" if record.observed_cost is None else f"{number(record.observed_cost)} observed"
-    if i + 1 < len(recording.steps) and takes_target(recording.steps[i + 1]):
+    taken_next = i + 1 < len(recording.steps) and takes_target(recording.steps[i + 1])
+    if record.observed_cost is not None and taken_next:
         observed += ", as a grasp that takes the target out is known then"
     worse = record.observed_cost is not None and record.observed_cost > record.predicted_cost + 0.1 * record.cost
     return f"J: {number(record.cost)} before, {number(record.predicted_cost)} expected, {observed}", worse

@@ -127,6 +127,8 @@ class NativeTrials:
                 return TrialResult.UNKNOWN
             result = TrialResult.UNKNOWN
             for number in range(1 + self.nearby.scenes * kind.takes_target):
+                if not needed():
+                    return None
                 result = _attempted(near[number], kind, motion[0], int(action.object), needed)
                 if result is not TrialResult.SUCCEEDED:
                     break

@@ -42,7 +42,9 @@ class Nearby:
     def __post_init__(self):
         for name in ("scenes", "place", "size"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"Nearby: {name} {getattr(self, name)} must not be negative")
+                raise InputError(f"Nearby: {name} {getattr(self, name)} must be finite and not negative")
+        if self.scenes != int(self.scenes):
+            raise InputError(f"Nearby: scenes {self.scenes} must be a whole number")
 
     def drawn(self, scenes: TrialScenes, number: int) -> TrialScenes:
         """All scenes, each a little off; the same differences whenever the number is the same.

@@ -49,7 +49,8 @@ class ActionConfig:
         yaws and three wrists these keep most of the feasible pushes in published scenes.
       grasps: how an object is grasped.
       placements: number of places drawn for a picked object, and number of those tested for collision.
-      place_yaw: largest angle by which a picked object is turned [rad].
+      place_yaw: largest angle by which a picked object is turned [rad]; more if the hand would else come from more than
+        `ActionSpace.max_yaw`.
       clearance: distance to neighbours when placing [m].
       contact_tolerance: depth of contact with other objects that is allowed on a picked object's way out [m]: touching
         objects are often recognised as overlapping, and would lock each other in.
@@ -144,7 +145,8 @@ class ActionSpace:
     Attributes:
       shelf, tables: data.
       gripper, config: static.
-      max_yaw: largest yaw of grasps, as in `graspability.GraspConfig` [rad]; static.
+      max_yaw: largest yaw of grasps of the target and of round objects, and of the hand as it puts anything down [rad];
+        of grasps of flat sides see `ObjectGraspConfig.max_yaw`; static.
       waypoints: number of poses at which an approach must be reachable; static.
     """
 

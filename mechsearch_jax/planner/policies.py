@@ -88,15 +88,17 @@ class Plan(Protocol):
 class PlanningPolicy(flax.struct.PyTreeNode):
     """The engine as a `Policy`: takes a found target out as soon as a grasp hits nothing, and otherwise plans.
 
+    After trials a grasp that fails there is not made; see `trials.choose`.
+
     It also implements `trials.AsksTwice`.
 
     Attributes:
       config: settings of the planner.
       propose, predict, objective, drawn_in: the slots; static.
       plan: plans with the slots; static.
-      tries: whether decisions hold alternatives for trials; static. The decision itself does not depend on it: a grasp
-        must hit nothing, unless `trials.choose` prefers one that succeeded in a trial; `config.retrieval_contact` says
-        whether there are such alternatives.
+      tries: whether decisions hold alternatives for trials; static. The action does not depend on it: a grasp must hit
+        nothing. But `cost` and `sequences` are then those of the plan, for where no grasp succeeds in its trial.
+        `config.retrieval_contact` says whether grasps that hit something are among the alternatives.
     """
 
     config: PlannerConfig
@@ -139,10 +141,11 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         grasp = self.retrieval(key, problem, belief, observation)
         able = grasp.action.kind == ActionKind.RETRIEVE
         # The belief may be concrete while the observation is traced.
-        if not isinstance(able, Tracer) and able and not self.tries:
-            return grasp
         seen = observation
-        if isinstance(able, Tracer) and not self.tries:
+        if not self.tries:
+            # The belief may be concrete while the observation is traced.
+            if not isinstance(able, Tracer):
+                return grasp if able else self.planned(key, problem, belief, observation)
             # Both are computed, but the one that does not count has next to nothing to do. Under `vmap`, a `cond` would
             # give every scene of a batch its own problem, and what they share could no longer be computed together.
             objects = observation.objects

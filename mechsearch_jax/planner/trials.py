@@ -77,7 +77,8 @@ class Trials(Protocol):
         """The `TrialResult` of each action.
 
         Actions after the first success of a row need not be tried; their results, and those of actions that are not
-        wanted, are ignored. For a retrieval it only counts whether it succeeds.
+        wanted, are ignored. For a retrieval it counts whether it succeeds, and
+        whether any has a result at all; see `choose`.
 
         Args:
           problem: constants of the search.
@@ -204,10 +205,10 @@ def in_turn(first: Alternatives, then: Alternatives) -> Alternatives:
 def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
     """Choose an action by the results of trials.
 
-    The first alternative that succeeds is chosen. If none does: a retrieval that the decision already makes is kept if
-    the results of all grasps are unknown; else the first alternative that begins a sequence and did no harm is chosen;
-    else nothing. Sequences whose first action did harm, or has an unknown result, or is like one of these, are refused.
-    A decision without alternatives stays unchanged.
+    A grasp that succeeds is chosen first. Else a retrieval that the decision already makes is kept if the results of
+    all grasps are unknown. Else the first other alternative that succeeds is chosen, else the first that begins a
+    sequence and did no harm, else nothing. Sequences whose first action did harm, or has an unknown result, or is like
+    one of these, are refused. A decision without alternatives stays unchanged.
 
     Args:
       decision: decision of a policy.
