@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from mechsearch_jax import benchmarks
 from mechsearch_jax.envs.cell import loading as cell
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -52,7 +51,7 @@ def test_a_file_says_workcell_and_planner(file):
 
 
 def test_the_second_cell_of_the_bench_differs_in_its_grasps_alone():
-    cells = Path(benchmarks.__file__).parent / "parts/cells"
+    cells = Path(__file__).resolve().parents[1] / "benchmarks/parts/cells"
     usual, more = (load_settings(cells / f"{name}.toml") for name in ("other-cell", "other-cell-more-grasps"))
     assert dataclasses.replace(more, given={}) == dataclasses.replace(usual, given={})
     assert not usual.given

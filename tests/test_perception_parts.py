@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.benchmarks.looks.bodies import Bench, Truth
@@ -204,6 +204,7 @@ def evidence(points, rays, pixels=1000.0):
 
 
 @settings(max_examples=20, deadline=None)
+@example(np.ones((6, 12)), np.zeros((6, 10), bool), 0)
 @given(
     arrays.arrays(np.float64, (6, 12), elements=st.floats(0, 1)),
     arrays.arrays(bool, (6, 10)),

@@ -162,13 +162,18 @@ def select_union(
 
     price_of_one = price[0]
 
+    def not_empty(after, others):
+        """The costs of adding each candidate, or none, to others; a union of none is no choice."""
+        return jnp.where((jnp.arange(count + 1) == count) & jnp.all(others == count), jnp.inf, after)
+
     def changed(slots):
         """The cost of putting each candidate, or none, into each slot, shape (k, C + 1)."""
 
         def without(slot):
             others = jnp.where(jnp.arange(len(slots)) == slot, count, slots)
             left, passed = jnp.min(misfit[others], axis=0), jnp.any(through[others], axis=0)
-            return total(jnp.minimum(misfit, left[None]), through | passed[None], price + jnp.sum(price[others]))
+            after = total(jnp.minimum(misfit, left[None]), through | passed[None], price + jnp.sum(price[others]))
+            return not_empty(after, others)
 
         return jax.vmap(without)(jnp.arange(len(slots)))
 
@@ -189,7 +194,7 @@ def select_union(
 
     def with_first(first):
         left, passed = jnp.minimum(misfit, misfit[first][None]), through | through[first][None]
-        return total(left, passed, price + price[first])
+        return not_empty(total(left, passed, price + price[first]), first[None])
 
     pairs = jax.lax.map(with_first, jnp.arange(count + 1))
     pair = jnp.stack(jnp.unravel_index(jnp.argmin(pairs), pairs.shape))
