@@ -29,7 +29,7 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default. Fields of the page are named after them.
-RUNS = ("table1-h200", "report-e-h200", "collision-free-h200", "first-actions-h200")
+RUNS = ("table1-nearby-h200", "report-f-h200", "collision-free-h200", "report-e-h200")
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -199,17 +199,15 @@ def _loss(full: Sequence[Row], true: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def default_rates(
-    table1: StoredRun, report_e: StoredRun, collision_free: StoredRun, first_actions: StoredRun
-) -> dict[str, Any]:
+def default_rates(table1: StoredRun, report: StoredRun, collision_free: StoredRun, former: StoredRun) -> dict[str, Any]:
     """The fields of the template about what the default reaches, with true shapes and from images."""
     usual = Method()
     masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
     grasps = dataclasses.replace(masks, config=usual.config.with_options(retrieval_contact=False))
-    new, new_full = (_on_new_scenes(report_e, method) for method in (usual, full))
-    default = {**_named("`c2` 090 to 179", _on_new_scenes(table1, usual)), **_named("`report-e`", new)}
+    new, new_full = (_on_new_scenes(report, method) for method in (usual, full))
+    default = {**_named("`c2` 090 to 179", _on_new_scenes(table1, usual)), **_named("`report-f`", new)}
     free = _named("`masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, grasps))
-    seen = _named("`full`, `report-e`", new_full)
+    seen = _named("`full`, `report-f`", new_full)
     return {
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps({**default, **seen}),
@@ -223,7 +221,7 @@ def default_rates(
             },
         ),
         "loss": _loss(new_full, new),
-        "loss_before": _loss(*(_on_new_scenes(first_actions, method) for method in (full, usual))),
+        "loss_before": _loss(*(_on_new_scenes(former, method) for method in (full, usual))),
     }
 
 
