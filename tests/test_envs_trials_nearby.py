@@ -50,6 +50,23 @@ def test_differences_are_as_large_as_they_are_said_to_be():
     assert all(d.objects.rotation is plain.objects.rotation for d in drawn)
 
 
+def test_things_are_rougher_and_heavier_in_one_scene_and_smoother_and_lighter_in_another():
+    near, plain = Nearby(friction=1.5, mass=2.0), scenes(2)
+    plain = plain.replace(friction=np.float32([1.0, 0.8]))
+    drawn = [near.drawn(plain, number) for number in (1, 2, 3, 4)]
+    for each, power in zip(drawn, (1, -1, 0, 1), strict=True):
+        np.testing.assert_allclose(each.friction, np.float32([1.0, 0.8]) * 1.5**power, rtol=1e-6)
+        np.testing.assert_allclose(each.mass, 2.0**power, rtol=1e-6)
+        assert each.friction.dtype == each.mass.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", ["friction", "mass"])
+def test_factors_below_one_are_refused(name):
+    for value in (0.9, float("nan"), float("inf")):
+        with pytest.raises(InputError, match=f"Nearby: {name} .* must be a finite factor of at least 1"):
+            Nearby(**{name: value})
+
+
 @pytest.mark.parametrize("name", ["scenes", "place", "size"])
 def test_impossible_numbers_are_refused(name):
     for value in (-1, float("nan"), float("inf")):

@@ -1,7 +1,8 @@
 """Scenes near a recognised one, in which a grasp of the target has to succeed, too.
 
 A grasp that brushes something may take the target out in one scene and be held up in another that is a third of a
-millimetre off, less than recognition can know. One trial says nothing of that.
+millimetre off, less than recognition can know, or where things are rougher or heavier than assumed. One trial says
+nothing of that.
 """
 
 from __future__ import annotations
@@ -30,16 +31,23 @@ class Nearby:
       scenes: their number; 0 for none.
       place: standard deviation of the places of objects and target along x and y [m].
       size: standard deviation of the objects' sizes along their own x and y, as a share.
+      friction, mass: factors on all frictions and masses: of the first scene, its inverse of the second, none of the
+        third, and so on; about how far off an assumed friction is.
 
     Raises:
-      InputError: a number is negative or not finite.
+      InputError: a number is negative or not finite, or a factor below 1.
     """
 
     scenes: int = 3
     place: float = 5e-4
     size: float = 5e-3
+    friction: float = 1.5
+    mass: float = 1.5
 
     def __post_init__(self):
+        for name in ("friction", "mass"):
+            if not 1 <= getattr(self, name) < math.inf:
+                raise InputError(f"Nearby: {name} {getattr(self, name)} must be a finite factor of at least 1")
         for name in ("scenes", "place", "size"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"Nearby: {name} {getattr(self, name)} must be finite and not negative")
@@ -63,7 +71,14 @@ class Nearby:
         position = objects.position + np.float32(rng.normal(0.0, self.place, slots)) * level
         size = objects.size * (1 + np.float32(rng.normal(0.0, self.size, slots)) * level)
         pose = scenes.pose + np.append(rng.normal(0.0, self.place, 2), 0.0).astype(np.float32)
-        return scenes.replace(objects=objects.replace(position=position, size=size), pose=pose)
+        # More friction first: it is what holds the arm up.
+        power = (0, 1, -1)[number % 3]
+        return scenes.replace(
+            objects=objects.replace(position=position, size=size),
+            pose=pose,
+            friction=scenes.friction * np.float32(self.friction**power),
+            mass=scenes.mass * np.float32(self.mass**power),
+        )
 
 
 class ScenesNear(Generic[Scene]):
