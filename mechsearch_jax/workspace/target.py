@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
-from mechsearch_jax.shapes.meshes import convex_pieces
+from mechsearch_jax.shapes.meshes import QUICKLY, convex_pieces
 from mechsearch_jax.shapes.solid import Solid, solid_of
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -121,7 +121,7 @@ class Target:
         Raises:
           InputError: the file cannot be read, is no solid mesh, or is too large.
         """
-        return cls.from_parts(convex_pieces(Path(path), scale, "Target: mesh"), density, friction, colour)
+        return cls.from_parts(convex_pieces(Path(path), scale, "Target: mesh", QUICKLY), density, friction, colour)
 
     @classmethod
     def of_body(cls, body: Body) -> Target:
