@@ -78,5 +78,5 @@ def test_what_is_no_target_is_refused_in_one_line(tmp_path):
         Target.from_mesh(tmp_path / "nothing.stl")
     with pytest.raises(InputError, match="at most"):
         Target.from_parts((Piece("box", (1.5, 0.1, 0.1)),))
-    with pytest.raises(InputError, match="Target.from_parts"):
+    with pytest.raises(InputError, match=r"Target\.from_parts"):
         Target(COMPOUND)

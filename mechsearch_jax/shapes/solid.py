@@ -49,6 +49,11 @@ class Solid(Protocol):
         ...
 
     @property
+    def ends_alike(self) -> bool:
+        """Whether it looks the same upside down."""
+        ...
+
+    @property
     def yaws(self) -> int:
         """Usual number of candidate yaw angles over a `turn`."""
         ...
@@ -118,6 +123,10 @@ class Whole:
         return math.pi
 
     @property
+    def ends_alike(self) -> bool:
+        return True
+
+    @property
     def yaws(self) -> int:
         return self.shape.yaws
 
@@ -169,6 +178,10 @@ class Union:
     @property
     def turn(self) -> float:
         return _symmetry(self.compound) or math.pi
+
+    @property
+    def ends_alike(self) -> bool:
+        return False
 
     @property
     def yaws(self) -> int:
@@ -248,16 +261,24 @@ def _rim(compound: Compound) -> Float[np.ndarray, "corners 2"]:
 
 
 @functools.lru_cache(maxsize=256)
-def surface(compound: Compound, count: int) -> Float[np.ndarray, "n 3"]:
-    """About `count` points spread evenly over the surface of the union of a compound's solids [m]; must not be
-    changed."""
+def surface(compound: Compound, count: int, erosion: float = 0.0) -> Float[np.ndarray, "n 3"]:
+    """At most `count` points spread evenly over the surface of the union of a compound's solids [m]; must not be
+    changed.
+
+    Args:
+      compound: centred.
+      count: number of points.
+      erosion: by how much every solid is shrunk on all sides [m].
+    """
     import trimesh
 
-    whole: Any = trimesh.util.concatenate([mesh(solid) for solid in solids(compound.pieces)])
-    points, face = trimesh.sample.sample_surface(whole, 3 * count, seed=0)
+    whole: Any = trimesh.util.concatenate(Union(compound).hulls(erosion))
+    points, face = trimesh.sample.sample_surface(whole, 4 * count, seed=0)
     # Where solids touch or overlap, there is another one just outside of a surface.
     outside = np.asarray(points) + JUST_OUTSIDE * np.asarray(whole.face_normals)[face]
-    return np.asarray(points)[~union.inside(compound, outside)][:count]
+    free = np.asarray(points)[~union.inside(compound, outside, erosion)]
+    # In random order: any leading ones are spread evenly, too.
+    return free[np.random.default_rng(0).permutation(len(free))[:count]]
 
 
 @functools.lru_cache(maxsize=256)

@@ -48,6 +48,11 @@ class Target:
     yaws: int = 1
     compound: Compound | None = None
 
+    def __repr__(self) -> str:
+        # Without a compound as before there were any: the text identifies saved problems and searches.
+        fields = [field.name for field in dataclasses.fields(self) if field.name != "compound" or self.compound]
+        return f"Target({', '.join(f'{name}={getattr(self, name)!r}' for name in fields)})"
+
     def __post_init__(self):
         if len(self.half_size) != 3 or not all(0 < s <= LARGEST for s in self.half_size):
             raise InputError(
@@ -186,6 +191,11 @@ class Target:
     def top(self) -> float:
         """How far its highest point is above its centre [m]."""
         return self.solid.top
+
+    @property
+    def tall(self) -> float:
+        """Its height [m]."""
+        return self.bottom + self.top
 
     def height(self, shelf: Shelf) -> float | Array:
         """z of the centre of a target that stands on the board [m]; the shelf may be traced."""
