@@ -172,7 +172,8 @@ def _compound_grasps(
     target: Target, compound: Compound, gripper: Gripper, config: GraspConfig
 ) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
     """`_target_grasps` of a target of pieces: each closing of `robot.compound_grasps` at the tilts that it allows."""
-    yaws = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0] if target.solid.round else None
+    directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
+    yaws = directions.tolist() if target.solid.round else None
     found = closings(compound, gripper, yaws, config.tilts, config.height)
     rows = [
         (found.yaw[i], config.tilts[tilt], wrist, *found.point[i])

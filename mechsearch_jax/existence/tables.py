@@ -19,7 +19,7 @@ from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
-from mechsearch_jax.workspace.target_view import body_at, surface_cloud, window_image
+from mechsearch_jax.workspace.target_view import box_around, extent, framed, surface_cloud, window_image
 
 # Places whose images are computed at once.
 BLOCK = 256
@@ -53,11 +53,11 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     T = jax.jit(upright_pose)(np.asarray(places, np.float32), target.height(shelf))
     coarse = camera.scaled(config.step(camera))
     half = np.array(target.half_size, np.float32)
-    window, around = target_window(coarse, half, T)
+    window, around = target_window(coarse, extent(target)[1], framed(target, T))
 
     def view(coarse, pose):
-        placed = body_at(target, pose[:3, 3], pose[:3, :3], jnp.array(True))
-        return window_image(coarse, target, pose, window), render.window_place(coarse, placed, around)[0]
+        first, _ = render.window_place(coarse, box_around(target, pose), around)
+        return window_image(coarse, target, pose, window), first
 
     view_all = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
     if target.compound is not None:

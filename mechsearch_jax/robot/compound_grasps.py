@@ -162,11 +162,12 @@ def between(
 
 
 def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], opening: float) -> tuple[float, float]:
-    """Half-extents across the fingers of what is between them, at least and at most [m]; 0 where there is nothing."""
+    """Half of the width of what is between open fingers [m]: on the widest line across the pads, and between the pads
+    as they come to rest; 0 where there is nothing."""
     ends, _ = between(field_of(compound), T_body_gripper[:3, :3], T_body_gripper[:3, 3], opening)
     if np.isnan(ends).all():
         return 0.0, 0.0
-    return float(np.nanmin(ends[:, 1] - ends[:, 0])) / 2, float(np.nanmax(ends[:, 1]) - np.nanmin(ends[:, 0])) / 2
+    return float(np.nanmax(ends[:, 1] - ends[:, 0])) / 2, float(np.nanmax(ends[:, 1]) - np.nanmin(ends[:, 0])) / 2
 
 
 def _closing(field: Field, gripper: Gripper, yaw: float, point: np.ndarray, usual: float) -> _Line | None:

@@ -222,11 +222,6 @@ class Union:
         return [_shrunk(solid, erosion) for solid in solids(self.compound.pieces)]
 
 
-def solid_of(what: Compound | tuple[Shape, tuple[float, float, float]]) -> Solid:
-    """The solid of a compound, which is centred, or of a shape with half-extents [m]."""
-    return Union(what) if isinstance(what, Compound) else Whole(*what)
-
-
 def _shrunk(solid: Piece, erosion: float) -> trimesh.Trimesh:
     """A convex solid in the body's frame, shrunk on all sides, to no less than half of its size."""
     import trimesh

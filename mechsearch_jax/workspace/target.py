@@ -15,7 +15,7 @@ from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
 from mechsearch_jax.shapes.meshes import QUICKLY, convex_pieces
-from mechsearch_jax.shapes.solid import Solid, solid_of
+from mechsearch_jax.shapes.solid import Solid, Union, Whole
 from mechsearch_jax.workspace.shelf import Shelf
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class Target:
 
     @classmethod
     def _of_compound(cls, compound: Compound) -> Target:
-        return cls(COMPOUND, half_extents(compound), yaws=solid_of(compound).yaws, compound=compound)
+        return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
 
     def like(self, other: Target) -> Target:
         """Another target with this one's grid and inset.
@@ -175,7 +175,7 @@ class Target:
     @property
     def solid(self) -> Solid:
         """Its geometry."""
-        return solid_of(self.compound or (shape_of(self.shape), self.half_size))
+        return Union(self.compound) if self.compound else Whole(shape_of(self.shape), self.half_size)
 
     @property
     def turn(self) -> float:

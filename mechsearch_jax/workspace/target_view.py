@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import placed_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make, transform
 from mechsearch_jax.shapes import solid, union
 from mechsearch_jax.shapes.parts import part_rows
 from mechsearch_jax.workspace import render
@@ -78,7 +79,7 @@ def window_image(
       T_world_target: its pose.
       window: rows and columns; static.
     """
-    box = _box(target, T_world_target)
+    box = box_around(target, T_world_target)
     if target.compound is None:
         return render.object_window(camera, box, window)
     corner, stride = render.window_place(camera, box, window)
@@ -86,18 +87,32 @@ def window_image(
     middle = (stride - 1) / 2.0
     along = pixel_rays(camera, rows * stride + corner[0] + middle, columns * stride + corner[1] + middle)
     R, offset = T_world_target[:3, :3], jnp.array(camera.position) - T_world_target[:3, 3]
-    start = [sum(offset[j] * R[j, i] for j in range(3)) for i in range(3)]
+    origin = [sum(offset[j] * R[j, i] for j in range(3)).reshape(1, 1) for i in range(3)]
     local = [sum(along[..., j] * R[j, i] for j in range(3)) for i in range(3)]
-    origin = [jnp.broadcast_to(component, local[0].shape) for component in start]
     return render.Window(union.cut(target.compound, origin, local, 0.0, jnp), corner, stride)
 
 
-def _box(target: Target, T_world_target: Float[Array, "4 4"]) -> Superquadrics:
-    """The superquadric of the target's half-extents at a pose."""
+def extent(target: Target) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """The middle of the smallest box around the target along its axes, and its half-extents [m], float32."""
+    against, along = target.solid.extent(np.eye(3), np)
+    return np.float32((along - against) / 2), np.float32((along + against) / 2)
+
+
+def framed(target: Target, T_world_target: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
+    """Poses of the box of `extent` from the target's; for a box or a cylinder they are the same."""
+    if target.compound is None:
+        return T_world_target
+    middle = transform(T_world_target[..., None, :, :], jnp.asarray(extent(target)[0])[None])[..., 0, :]
+    return make(T_world_target[..., :3, :3], middle)
+
+
+def box_around(target: Target, T_world_target: Float[Array, "4 4"]) -> Superquadrics:
+    """The box of `extent` at a pose of the target, or the target itself if it is one superquadric."""
+    T_world_box = framed(target, T_world_target)
     return Superquadrics(
-        size=jnp.float32(target.half_size),
+        size=jnp.float32(target.half_size if target.compound is None else extent(target)[1]),
         exponents=jnp.float32(target.exponents),
-        position=T_world_target[:3, 3],
+        position=T_world_box[:3, 3],
         rotation=T_world_target[:3, :3],
         valid=jnp.array(True),
     )
