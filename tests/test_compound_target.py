@@ -97,7 +97,9 @@ def test_grasps_close_on_material_and_reach_it_free(target):
         local = (body - pose[:3, 3]) @ pose[:3, :3]
         for back in np.linspace(0.0, 0.15, 16):
             for box in boxes:
-                placed = (local + [0.0, 0.0, back] - box.T_frame_primitive[:3, 3]) @ box.T_frame_primitive[:3, :3]
+                placed = (local + np.array([0.0, 0.0, back]) - box.T_frame_primitive[:3, 3]) @ box.T_frame_primitive[
+                    :3, :3
+                ]
                 assert not (np.abs(placed) < np.array(box.size) - 0.002).all(axis=1).any()
     yaw = np.arctan2(T[:, 1, 2], T[:, 0, 2])
     if not target.solid.round:
