@@ -1,7 +1,6 @@
 """The configuration file: what it gives, what it leaves alone, and how it refuses what is wrong."""
 
 import dataclasses
-import json
 import re
 import types
 from pathlib import Path
@@ -255,34 +254,3 @@ half_size = [0.018, 0.018, 0.045]
     assert scene.target.half_size == (0.018, 0.018, 0.045)
     assert all(body.position[0] < 0.75 and body.position[1] < 0.4 for body in (*scene.objects, scene.target))
     assert target_of(scene, load_settings(tmp_path / "mine.toml").workcell.target).half_size == (0.018, 0.018, 0.045)
-
-
-MUG = {
-    "density": 500,
-    "friction": 0.4,
-    "pieces": [{"shape": "box", "half_size": [0.03, 0.02, 0.05], "position": [0, 0, 0], "quaternion": [1, 0, 0, 0]}],
-}
-
-
-def test_the_target_may_be_of_another_file(tmp_path):
-    (tmp_path / "mug.json").write_text(json.dumps(MUG))
-    target = load(tmp_path, '[target]\nfile = "mug.json"\ngrid = [9, 22]\n').workcell.target
-    assert (target.shape, target.grid) == ("compound", (9, 22))
-    assert target.compound is not None
-    assert load(tmp_path, '[target]\nfile = ""\n') == Settings()
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('file = "none.stl"', "mine.toml:2: [target] file: "),
-        ('file = "mug.json"\nshape = "box"', "mine.toml:3: [target] shape is that of the file; leave it out"),
-        ("file = 3", "[target] file must be a text, not 3"),
-        ("compound = 3", "[target] compound is unknown; did you mean file?"),
-    ],
-)
-def test_what_is_wrong_with_the_targets_file_is_named(tmp_path, text, message):
-    (tmp_path / "mug.json").write_text(json.dumps(MUG))
-    with pytest.raises(InputError) as caught:
-        load(tmp_path, f"[target]\n{text}\n")
-    assert message in str(caught.value)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
@@ -17,10 +16,8 @@ from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
-from mechsearch_jax.shapes.compound import COMPOUND
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.target import Target
-from mechsearch_jax.workspace.target_file import load_target
 
 PLANNER = "planner"
 # Largest coordinate of the base in a file's frame [m].
@@ -79,9 +76,6 @@ class Settings:
 # The keys of the target's table that are the workcell's `colour` and `hue_tolerance`; all others are of the `Target`.
 COLOR, HUE_TOLERANCE = "color", "hue_tolerance"
 
-# The key of the target's table that names the file of a target of any shape, from the folder of the configuration file.
-FILE = "file"
-
 # The defaults of a file's tables, without the planner's.
 _PARTS: Mapping[str, Any] = {
     **{
@@ -100,8 +94,7 @@ def tables() -> dict[str, dict[str, Any]]:
         name: {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
         for name, usual in _PARTS.items()
     }
-    parts["target"] = {FILE: "", **parts["target"], COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
-    del parts["target"][COMPOUND]
+    parts["target"] |= {COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
 
@@ -197,26 +190,11 @@ def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
 
 
 def _target(document: Document) -> Target:
-    """The target; the defaults of its other keys depend on its shape, or on the file that it is read from."""
-    table = dict(document.tables.get("target", {}))
-    if COMPOUND in table:
-        raise InputError(f"{document.where('target', COMPOUND)} is unknown; did you mean {FILE}?")
-    file = checked(table.pop(FILE, ""), str, document.where("target", FILE))
-    document = dataclasses.replace(document, tables={**document.tables, "target": table})
-    if file:
-        if given := {"shape", "half_size"} & set(table):
-            key = min(given)
-            raise InputError(f"{document.where('target', key)} is that of the {FILE}; leave it out")
-        path = Path(document.path).parent / file
-        return with_table(document, "target", apply(document, "target", {FILE: path}, _read_target))
-    name = table.get("shape", Target().shape)
+    """The target; the defaults of its other keys depend on its shape."""
+    name = document.tables.get("target", {}).get("shape", Target().shape)
     shape = checked(name, str, document.where("target", "shape"))
     usual = apply(document, "target", {"shape": shape}, lambda given: Target.of(given.get("shape", Target().shape)))
     return with_table(document, "target", usual)
-
-
-def _read_target(given: Mapping[str, Any]) -> Target:
-    return load_target(given[FILE]) if FILE in given else Target()
 
 
 def _with_planner(document: Document, settings: Settings) -> Settings:
