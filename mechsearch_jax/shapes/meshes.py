@@ -117,7 +117,7 @@ def convex_pieces(path: Path, scale: float, where: str, cut: Mapping[str, int] =
         status = path.stat()
     except OSError as error:
         raise InputError(
-            f"{where}: {path} cannot be read ({error.strerror}); its path counts from the scenario's folder"
+            f"{where}: {path} cannot be read ({error.strerror}); a path in a file counts from that file's folder"
         ) from None
     if status.st_size > LARGEST_FILE:
         raise InputError(f"{where}: {path} is larger than {LARGEST_FILE >> 20} MiB; simplify the mesh")

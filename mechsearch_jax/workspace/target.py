@@ -105,7 +105,7 @@ class Target:
         """
         if not pieces:
             raise InputError("Target: a target of pieces needs at least one")
-        return cls._of_compound(centred(Compound(tuple(pieces), density, friction, colour))[0])
+        return cls.of_compound(Compound(tuple(pieces), density, friction, colour))
 
     @classmethod
     def from_mesh(
@@ -135,10 +135,16 @@ class Target:
         Raises:
           InputError: as `of`.
         """
-        return cls.of(body.shape, body.half_size) if body.compound is None else cls._of_compound(body.compound)
+        return cls.of(body.shape, body.half_size) if body.compound is None else cls.of_compound(body.compound)
 
     @classmethod
-    def _of_compound(cls, compound: Compound) -> Target:
+    def of_compound(cls, compound: Compound) -> Target:
+        """The target that a compound is, which stands upright in its frame, z up.
+
+        Raises:
+          InputError: it is too large.
+        """
+        compound, _ = centred(compound)
         return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
 
     def like(self, other: Target) -> Target:
