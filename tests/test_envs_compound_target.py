@@ -1,4 +1,4 @@
-"""A target that is a compound in the world: its files, arrays and image, how it rests, in trials and in the batch model."""
+"""A target that is a compound in the world: its files, arrays and image, how it rests, in trials and in the batch."""
 
 import dataclasses
 import json
@@ -78,7 +78,8 @@ def test_a_scenario_with_a_compound_target_is_written_and_read(tmp_path, target)
     scene = hidden(target, BOX, yaw=0.5)
     scenarios.save_scenario(scene, tmp_path / "scene.json")
     again = scenarios.load_scenario(tmp_path / "scene.json")
-    assert again == scene and again.content_hash == scene.content_hash
+    assert again == scene
+    assert again.content_hash == scene.content_hash
     assert json.loads((tmp_path / "scene.json").read_text())["version"] == 2
     assert target_of(again, Target()) == target
     assert hash(target_of(again, Target())) == hash(target)
@@ -128,7 +129,8 @@ def test_it_stands_where_it_is_put(target):
     simulator = NativeWorld()
     before = simulator.reset(hidden(target, BOX, yaw=0.5))
     outcome = simulator.settle()
-    assert bool(outcome.settled) and not np.asarray(outcome.fallen).any()
+    assert bool(outcome.settled)
+    assert not np.asarray(outcome.fallen).any()
     np.testing.assert_allclose(simulator.world.position, before.position, atol=1e-3)
     assert simulator.world.rotation[TARGET][2, 2] > 0.999
     assert simulator.scenario("after").target.compound == target.compound
@@ -147,7 +149,8 @@ def test_a_found_target_stands_in_trials_as_what_it_is():
     for found in (True, False):
         world = jax.device_get(trials._world(MUG, SHELF, nothing, at, jnp.array(found)))
         scene = trials._at_rest(cell, simulation, world, nothing, 1.0, 1.0)
-        assert scene is not None and not scene.diverged
+        assert scene is not None
+        assert not scene.diverged
         body = scene._bodies[TARGET]
         assert (body is not None) == found
         if found:
@@ -224,7 +227,8 @@ def test_a_target_is_read_from_a_mesh_or_a_body(tmp_path):
         (tmp_path / "turned.json").write_text(json.dumps({**made, "quaternion": ON_ITS_SIDE}))
         turned = load_target(tmp_path / "turned.json")
         np.testing.assert_allclose(turned.half_size, (0.03, 0.05, 0.02), atol=1e-6)
-        assert turned.bottom == pytest.approx(0.02, abs=1e-6) and turned.compound.density == 500.0
+        assert turned.bottom == pytest.approx(0.02, abs=1e-6)
+        assert turned.compound.density == 500.0
 
 
 @pytest.mark.parametrize(
@@ -240,4 +244,5 @@ def test_what_is_wrong_with_a_target_file_is_named(tmp_path, value, message):
     (tmp_path / "body.json").write_text(json.dumps(value))
     with pytest.raises(InputError) as caught:
         load_target(tmp_path / "body.json")
-    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
