@@ -22,19 +22,21 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
+from mechsearch_jax.robot.compound_grasps import closings
 from mechsearch_jax.robot.entry import WaysIn, gripper_enters
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.shapes.compound import Compound
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.swept_target import swept_target
 from mechsearch_jax.workspace.target import Target
 
 # Number of points of a cloud that are tested first.
@@ -144,8 +146,10 @@ def _target_grasps(
     """`T_target_gripper` of each grasp, and the index of its wrist.
 
     Raises:
-      InputError: the target is too wide for the gripper.
+      InputError: no grasp fits the target.
     """
+    if target.compound is not None:
+        return _compound_grasps(target, target.compound, gripper, config)
     yaws, widths = shape_of(target.shape).grasps(target.half_size, config.yaws, config.max_yaw)
     yaws = yaws[widths <= gripper.usable_opening]
     if len(yaws) == 0:
@@ -156,16 +160,34 @@ def _target_grasps(
     yaw, tilt, wrist = np.float32(grasps[:, 0]), np.float32(grasps[:, 1]), grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
     above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
-    T = jax.jit(lambda yaw, tilt, above: make(gripper_rotation(yaw, tilt), above))(yaw, tilt, above)
-    return T, wrist
+    return _posed(yaw, tilt, above), wrist
 
 
-def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
-    """Surface of the volume that the target sweeps along a direction, in its own frame, shape (count, 3) [m]."""
-    mesh = shape_of(target.shape).mesh([h - erosion for h in target.half_size])
-    both = np.concatenate([mesh.vertices, mesh.vertices + distance * np.asarray(direction)])
-    points = trimesh.sample.sample_surface(trimesh.convex.convex_hull(both), count, seed=0)[0]
-    return np.asarray(points, np.float32)
+def _posed(yaw: np.ndarray, tilt: np.ndarray, point: np.ndarray) -> Float[Array, "g 4 4"]:
+    """`T_target_gripper` of grasps with these angles [rad] and points between the fingers [m]."""
+    return jax.jit(lambda yaw, tilt, point: make(gripper_rotation(yaw, tilt), point))(yaw, tilt, point)
+
+
+def _compound_grasps(
+    target: Target, compound: Compound, gripper: Gripper, config: GraspConfig
+) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
+    """`_target_grasps` of a target of pieces: each closing of `robot.compound_grasps` at the tilts that it allows."""
+    directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
+    yaws = directions.tolist() if target.solid.round else None
+    found = closings(compound, gripper, yaws, config.tilts, config.height)
+    rows = [
+        (found.yaw[i], config.tilts[tilt], wrist, *found.point[i])
+        for i in range(len(found.yaw))
+        for tilt in found.tilts[i]
+        for wrist in range(len(config.wrists))
+    ]
+    if not rows:
+        raise InputError(
+            f"Target: the gripper fits nowhere: it takes {gripper.usable_opening} m between two opposite sides that its"
+            " open fingers reach from the side; use another target"
+        )
+    table = np.array(rows)
+    return _posed(np.float32(table[:, 0]), np.float32(table[:, 1]), np.float32(table[:, 3:])), table[:, 2].astype(int)
 
 
 def feasible_grasps(

@@ -1,12 +1,14 @@
 """The configuration file: what it gives, what it leaves alone, and how it refuses what is wrong."""
 
 import dataclasses
+import math
 import re
 import types
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
@@ -254,3 +256,38 @@ half_size = [0.018, 0.018, 0.045]
     assert scene.target.half_size == (0.018, 0.018, 0.045)
     assert all(body.position[0] < 0.75 and body.position[1] < 0.4 for body in (*scene.objects, scene.target))
     assert target_of(scene, load_settings(tmp_path / "mine.toml").workcell.target).half_size == (0.018, 0.018, 0.045)
+
+
+PIECES = """[target]
+pieces = [
+ {shape = "box", half_size = [0.015, 0.05, 0.012], position = [0, 0, 0.012], quaternion = [1, 0, 0, 0]},
+ {shape = "box", half_size = [0.015, 0.014, 0.03], position = [0, 0, 0.054], quaternion = [1, 0, 0, 0]},
+]
+density = 700
+inset = 0.06
+"""
+
+
+def test_a_target_of_pieces_or_of_a_mesh(tmp_path):
+    target = load(tmp_path, PIECES).workcell.target
+    assert (target.shape, target.inset, target.yaws, len(target.compound.pieces)) == ("compound", 0.06, 6, 2)
+    assert target.compound.density == 700.0
+    assert target.bottom + target.top == pytest.approx(0.084)
+    trimesh.creation.box(extents=(30, 40, 100)).export(tmp_path / "brick.stl")
+    target = load(tmp_path, '[target]\nmesh = "brick.stl"\nscale = 0.001\nyaws = 4').workcell.target
+    assert (target.yaws, target.turn) == (4, math.pi)
+    np.testing.assert_allclose(target.half_size, (0.015, 0.02, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('mesh = "no.stl"', r"\[target\]\.mesh: .*no.stl cannot be read"),
+        ('mesh = "no.stl"\nshape = "box"', r"\[target\] shape: follows from the mesh"),
+        ('pieces = [{shape = "cone"}]', r"\[target\]\.pieces\[0\]"),
+        ('compound = "a"', r"\[target\] compound is unknown"),
+    ],
+)
+def test_a_wrong_target_of_pieces_is_refused(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        load(tmp_path, f"[target]\n{text}")

@@ -116,7 +116,7 @@ MESH = {k: v for k, v in MUG.items() if k not in ("pieces", "color")} | {"mesh":
     ("path", "new", "message"),
     [
         (("version",), 1, 'objects[0]: bodies of pieces or meshes need "version": 2'),
-        (("target",), MUG, "target: must have a shape, one of box, cylinder; only objects have pieces"),
+        (("target",), {**MUG, "density": 0}, "target.density: 0 must be a number from 1 to 25000 kg/m3"),
         (("objects", 0, "mass"), 1.0, 'objects[0]: unknown key "mass"; known are pieces, density, friction'),
         (("objects", 0, "density"), "much", 'objects[0].density: "much" must be a number from 1 to 25000 kg/m3'),
         (("objects", 0, "friction"), -1, "objects[0].friction: -1 must be a number from 0 to 5"),

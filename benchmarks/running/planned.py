@@ -42,8 +42,7 @@ class SceneOutline:
     @classmethod
     def of_scenario(cls, scenario: Scenario) -> SceneOutline:
         """The outline of a scenario."""
-        target = Target.of(scenario.target.shape, scenario.target.half_size)
-        return cls(scenario.name, scenario.content_hash, scenario.objects, target)
+        return cls(scenario.name, scenario.content_hash, scenario.objects, Target.of_body(scenario.target))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +68,7 @@ class PlannedJob:
     @property
     def target(self) -> Target:
         """The planner's description of its target."""
-        return self.method.workcell.target.resized(self.scene.target.shape, self.scene.target.half_size)
+        return self.method.workcell.target.like(self.scene.target)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -6,6 +6,7 @@ Every ray is cut with every body in closed form: neither a display nor OpenGL is
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from operator import add, sub
 
@@ -17,11 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.camera.compound_rays import cast_solids, solid_normals
 from mechsearch_jax.envs.world.model import shelf_corners
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World
+from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, TargetCompoundWorld, World
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
-from mechsearch_jax.shapes.compound import MOST_SOLIDS
+from mechsearch_jax.shapes.compound import MOST_SOLIDS, half_extents
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -49,6 +50,8 @@ LIGHT = (-0.62, 0.25, 0.74)
 AMBIENT = 0.55
 # Windows around the target have a multiple of so many rows and columns.
 WINDOW_BLOCK = 16
+# Half-extents of a usual target, 0.1 m tall [m].
+USUAL_HALF_SIZE = (0.02, 0.02, 0.05)
 # What the shelf is made of.
 _BOARD = shape_of("box")
 
@@ -213,12 +216,12 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None, appearance
 
 
 def _pictured(world: World) -> Appearance:
-    """The appearance in pictures: compounds have their own colours, if they have any."""
+    """The appearance in pictures: objects that are compounds have their own colours, if they have any."""
     colours: jax.Array | np.ndarray = PALETTE
     if isinstance(world, CompoundWorld):
-        given = world.compounds.matter.colour
-        bodies = jnp.where(jnp.isnan(given), PALETTE[:BODIES], given)
-        colours = jnp.concatenate([bodies, PALETTE[BODIES:]])
+        given = world.compounds.matter.colour[:TARGET]
+        objects = jnp.where(jnp.isnan(given), PALETTE[:TARGET], given)
+        colours = jnp.concatenate([objects, PALETTE[TARGET:]])
     return Appearance(colours, np.array(LIGHT))
 
 
@@ -228,13 +231,23 @@ def _unit(vector: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     return vector / library.linalg.norm(vector)
 
 
-def target_window(camera: Camera) -> int:
-    """Side of a window of a camera's image that holds a 0.1 m tall target anywhere on the shelf, in pixels.
+def target_window(camera: Camera, half_size: Sequence[float] = USUAL_HALF_SIZE) -> int:
+    """Side of a window of a camera's image that holds a target anywhere on the shelf, in pixels.
 
-    The camera must not be traced. Recalibrating a camera hardly ever changes the window.
+    Args:
+      camera: must not be traced. Recalibrating a camera hardly ever changes the window.
+      half_size: of the target [m]; one that is smaller than the usual has the usual one's window.
     """
-    side = math.ceil(0.36 * max(camera.fx, camera.fy) / WINDOW_BLOCK) * WINDOW_BLOCK
+    larger = max(math.hypot(*map(float, half_size)) / math.hypot(*USUAL_HALF_SIZE), 1.0)
+    side = math.ceil(0.36 * larger * max(camera.fx, camera.fy) / WINDOW_BLOCK) * WINDOW_BLOCK
     return min(side, max(camera.width, camera.height))
+
+
+def window_of(camera: Camera, world: World) -> int:
+    """`target_window` of the target in a world; the usual one's if it is no compound."""
+    if isinstance(world, TargetCompoundWorld):
+        return target_window(camera, half_extents(world.target))
+    return target_window(camera)
 
 
 def target_pixels(camera: Camera, world: World, window: int | None = None) -> Int[Array, ""]:
@@ -245,9 +258,9 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
     Args:
       camera: the camera.
       world: the bodies.
-      window: side of the window; `target_window` if None; required for a traced camera.
+      window: side of the window; `window_of` if None; required for a traced camera.
     """
-    return pixels_in_window(camera, world, window or target_window(camera))
+    return pixels_in_window(camera, world, window or window_of(camera, world))
 
 
 @kept(static_argnames=("window",))

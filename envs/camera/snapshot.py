@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, true_camera
-from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window
+from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window, window_of
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View, thinned_view
@@ -22,6 +22,7 @@ from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 # What is recognised farther than this from a body stands for another one, or for none [m].
 NEAR = 0.1
@@ -41,14 +42,20 @@ class Sight(flax.struct.PyTreeNode):
     window: int = flax.struct.field(pytree_node=False)
 
 
-def sight_of(camera: Camera, shelf: Shelf) -> Sight:
-    """The `Sight` that recognisers need where camera and shelf are traced; the arguments here must not be traced."""
+def sight_of(camera: Camera, shelf: Shelf, target: Target | None = None) -> Sight:
+    """The `Sight` that recognisers need where camera and shelf are traced; the arguments here must not be traced.
+
+    Args:
+      camera, shelf: of the problem.
+      target: which the detector looks for; the usual one if None.
+    """
     try:
         view = thinned_view(camera, shelf)
     except InputError:
         # The oracle needs no view.
         view = None
-    return Sight(view, target_window(camera))
+    larger = target is not None and target.compound is not None
+    return Sight(view, target_window(camera, target.half_size) if larger else target_window(camera))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +96,7 @@ class Snapshot:
     @functools.cached_property
     def target_seen(self) -> Bool[Array, ""]:
         """Whether the detector finds the target in the image; much cheaper than casting the image."""
-        window = target_window(self.camera) if self.sight is None else self.sight.window
+        window = window_of(self.camera, self.world) if self.sight is None else self.sight.window
         return is_found(true_camera(self.camera, self.sensing), self.world, window)
 
     @property

@@ -43,7 +43,7 @@ def target_of(scenario: Scenario, usual: Target | None = None) -> Target:
       scenario: the shape's source.
       usual: the resolution's source; the default target if None.
     """
-    return (usual or Target()).resized(scenario.target.shape, scenario.target.half_size)
+    return (usual or Target()).like(Target.of_body(scenario.target))
 
 
 def run_episode(

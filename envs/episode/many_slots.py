@@ -91,7 +91,7 @@ class ManySlots:
         self._problem, self._trials = problem, trials
         self._learned = LearnedFriction(trials, len(world.kind)) if isinstance(trials, LearnsFriction) else None
         self._policy, self._mould = as_pytree(policy), mould(policy)
-        self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf)
+        self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf, problem.target)
         self._at_once = at_once
         self._count = len(world.kind)
         self._numbers = [numbers(self._policy)] * self._count

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mechsearch_jax.envs.camera.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
+from mechsearch_jax.envs.camera.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, SHELF
+from mechsearch_jax.envs.recording.body_solids import body_points, body_solids, moved, slot_colour
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.playback import Playback, playback
 from mechsearch_jax.envs.recording.recording import Recording
 from mechsearch_jax.envs.world.model import shelf_boxes
-from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.runtime.cores import cores
-from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.film import Layout, Moving, Page
 from mechsearch_jax.viz.panda import panda_solids
-from mechsearch_jax.viz.raycast import Colour, Eye, Solid
+from mechsearch_jax.viz.raycast import Eye, Solid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -62,10 +63,15 @@ class Film:
         eye = Eye(bystander(recording.shelf, width, height), LIGHT, AMBIENT, BACKGROUND_COLOUR)
         empty = eye.picture(list(shelf_solids(recording.shelf).values()))
         poses = link_poses(played.q)
+        shown = [body_solids(step.world) for step in recording.steps]
 
         def beside(row: int) -> UInt8[np.ndarray, "h w 3"]:
-            world = recording.steps[int(played.step[row])].world
-            solids = [*_body_solids(world, played, row), *panda_solids(poses[row], float(played.opening[row]))]
+            bodies = [
+                moved(solid, played.rotation[row, i], played.position[row, i])
+                for i, own in shown[int(played.step[row])].items()
+                for solid in own
+            ]
+            solids = [*bodies, *panda_solids(poses[row], float(played.opening[row]))]
             return eye.picture(solids, empty).pixels
 
         picture = empty.pixels
@@ -74,13 +80,14 @@ class Film:
                 step = recording.steps[index]
                 frame = recorded_frame(step, recording.camera, recording.shelf)
                 page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
+                points = body_points(step.world)
                 # Small lots, so that pictures do not pile up where drawing is slower.
                 for lot in _in_lots(rows, 2 * cores()):
                     # Of a robot that stands still the same picture is shown again.
                     drawn = pool.map(beside, [row for row in lot if not played.is_still(row)])
                     for row in lot:
                         picture = picture if played.is_still(row) else next(drawn)
-                        yield page.image(picture, _moving(step.world, played, row, poses[row]))
+                        yield page.image(picture, _moving(points, played, row, poses[row]))
 
 
 def bystander(shelf: Shelf, width: int, height: int) -> Camera:
@@ -103,12 +110,6 @@ def _in_lots(rows: Iterator[int], size: int) -> Iterator[list[int]]:
         yield lot
 
 
-def slot_colour(index: int) -> Colour:
-    """The colour of a body's slot, or of the shelf."""
-    red, green, blue = (float(c) for c in PALETTE[index])
-    return red, green, blue
-
-
 def shelf_solids(shelf: Shelf) -> dict[str, Solid]:
     """The shelf's boards by name, without those in `LEFT_OUT`."""
     boxes = {name: box for name, box in shelf_boxes(shelf).items() if name not in LEFT_OUT}
@@ -118,29 +119,11 @@ def shelf_solids(shelf: Shelf) -> dict[str, Solid]:
     }
 
 
-def _body_solids(world: World, played: Playback, row: int) -> list[Solid]:
-    return [
-        Solid(
-            in_order()[int(world.kind[i])],
-            np.asarray(world.half_size[i]),
-            played.rotation[row, i],
-            played.position[row, i],
-            slot_colour(i),
-        )
-        for i in np.flatnonzero(world.valid).tolist()
-    ]
-
-
-def _moving(world: World, played: Playback, row: int, poses: Float[np.ndarray, "8 4 4"]) -> Moving:
+def _moving(
+    points: Mapping[int, Float[np.ndarray, "points 3"]], played: Playback, row: int, poses: Float[np.ndarray, "8 4 4"]
+) -> Moving:
+    """The hand and the bodies at a moment, from points around the bodies by slot, in the bodies' frames."""
     bodies = [
-        _body_points(world, i) @ played.rotation[row, i].T + played.position[row, i] if valid else None
-        for i, valid in enumerate(world.valid)
+        points[i] @ played.rotation[row, i].T + played.position[row, i] if i in points else None for i in range(BODIES)
     ]
     return Moving(bodies, sketches.points_of_hand(poses[7], float(played.opening[row])), float(played.time[row]))
-
-
-def _body_points(world: World, i: int) -> Float[np.ndarray, "points 3"]:
-    """Points whose hull is a body, in its own frame [m]."""
-    half = [float(h) for h in world.half_size[i]]
-    level = in_order()[int(world.kind[i])].rim(half)
-    return np.concatenate([np.column_stack([level, np.full(len(level), z)]) for z in (-half[2], half[2])])

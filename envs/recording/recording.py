@@ -24,7 +24,7 @@ from mechsearch_jax.envs.recording.evidence import unpacked as unpacked_evidence
 from mechsearch_jax.envs.recording.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
 from mechsearch_jax.envs.simulators.simulator import ARM
 from mechsearch_jax.envs.simulators.trace import Trace
-from mechsearch_jax.envs.world.world import BODIES, World
+from mechsearch_jax.envs.world.world import BODIES, World, with_target
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -33,6 +33,7 @@ from mechsearch_jax.runtime.arrays import read_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
 from mechsearch_jax.shapes import in_order
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece
 from mechsearch_jax.viz.filmstrip import Frame
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
@@ -175,7 +176,7 @@ def save_recording(recording: Recording, path: PathLike) -> None:
         "format": FORMAT,
         "version": VERSION,
         "heading": recording.heading,
-        **{name: dataclasses.asdict(getattr(recording, name)) for name in _SETTINGS},
+        **{name: _written(getattr(recording, name)) for name in _SETTINGS},
         "steps": [{name: getattr(step, name) for name in _TEXTS} for step in steps],
     }
     if recording.episode is not None:
@@ -213,14 +214,16 @@ def load_recording(path: PathLike) -> Recording:
         if (head["format"], head["version"]) != (FORMAT, VERSION):
             raise ValueError("of another kind or version")
         texts, count = head["steps"], len(head["steps"])
-        settings = {name: kind(**_tuples(head[name])) for name, kind in _SETTINGS.items()}
+        settings = {name: kind(**_read(head[name])) for name, kind in _SETTINGS.items()}
         poses = len(settings["target"].candidate_poses(settings["shelf"]))
         _check(arrays, count, poses)
         ends = np.cumsum(arrays["rows"])
         more = zip(unpacked(arrays, count), unpacked_evidence(arrays, count, poses), strict=True)
         steps = [
             dataclasses.replace(
-                _step(arrays, texts[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from, evidence=e
+                _step(arrays, texts[i], i, slice(ends[i] - arrays["rows"][i], ends[i]), settings["target"]),
+                sampled=chosen_from,
+                evidence=e,
             )
             for i, (chosen_from, e) in enumerate(more)
         ]
@@ -268,8 +271,9 @@ def _no_world() -> World:
     return World(np.zeros(BODIES, np.int32), vectors, vectors, rotations, present)  # pyright: ignore[reportArgumentType]
 
 
-def _step(arrays: dict[str, np.ndarray], texts: dict[str, Any], i: int, rows: slice) -> RecordedStep:
+def _step(arrays: dict[str, np.ndarray], texts: dict[str, Any], i: int, rows: slice, target: Target) -> RecordedStep:
     trees = {name: kind(*(arrays[f"{name}.{f}"][i] for f in _fields(kind))) for name, kind in _TREES.items()}
+    trees["world"] = jax.tree.map(np.asarray, with_target(trees["world"], target))
     trees["action"] = trees["action"] if arrays["acts"][i] else None
     for name in _WITH_PARTS:
         if f"{name}.parts.size" in arrays:
@@ -282,6 +286,21 @@ def _step(arrays: dict[str, np.ndarray], texts: dict[str, Any], i: int, rows: sl
 def _fields(kind: type) -> tuple[str, ...]:
     """The names of the arrays of a pytree; parts of bodies are kept beside them."""
     return tuple(field.name for field in dataclasses.fields(kind) if field.name != "parts")
+
+
+def _written(setting: Any) -> dict[str, Any]:
+    """The fields of a setting; what a target is made of only where it is a compound."""
+    value = dataclasses.asdict(setting)
+    return {name: field for name, field in value.items() if name != COMPOUND or field is not None}
+
+
+def _read(value: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a setting, from `_written`."""
+    fields = _tuples(value)
+    if COMPOUND in fields:
+        made = dict(fields[COMPOUND])
+        fields[COMPOUND] = Compound(tuple(Piece(**piece) for piece in made.pop("pieces")), **made)
+    return fields
 
 
 def _tuples(value: Any) -> Any:

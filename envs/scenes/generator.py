@@ -32,6 +32,8 @@ from mechsearch_jax.workspace.target import Target
 
 # Shapes and half-extents of the paper's eleven objects; x and y of those that are not round may be swapped.
 CATALOGUE = ObjectSizes().catalogue
+# By so much the image is reduced in which a compound must not show at all.
+COARSE = 8
 # Draws an object, as it stands with its centre above the origin of a board at z 0.
 DrawBody = Callable[[np.random.Generator], Body]
 
@@ -48,7 +50,7 @@ class GeneratorConfig:
         yaw, instead of at candidate poses only.
       drift: a scene is at rest if no body moves farther than this once the target is in place [m].
       placements: number of places drawn for an object before the scene is discarded.
-      target_placements: number of poses drawn for a target that may stand anywhere.
+      target_placements: number of poses drawn for a target that may stand anywhere, or that is a compound.
       attempts: number of scenes drawn for one seed.
     """
 
@@ -185,21 +187,23 @@ class ScenarioGenerator:
             self._graspable = lambda pose: True
 
     @classmethod
-    def of(cls, settings: Settings, shape: str | None = None) -> ScenarioGenerator:
+    def of(cls, settings: Settings, target: str | Target | None = None) -> ScenarioGenerator:
         """The generator that a configuration file describes.
 
         Args:
           settings: of the workcell and the objects in it.
-          shape: of a target of the usual size, instead of the settings' own.
+          target: the name of a shape, of the usual size, or a target, instead of the settings' own.
 
         Raises:
           InputError: there is no such shape, or as the constructor.
         """
         cell = settings.workcell
-        target = cell.target
-        if shape is not None and shape != target.shape:
-            target = target.resized(shape, Target.of(shape).half_size)
-        return cls(target, cell.shelf, cell.camera, gripper=cell.gripper, draw=draws_from(settings.objects))
+        chosen = cell.target
+        if isinstance(target, Target):
+            chosen = chosen.like(target)
+        elif target is not None and target != chosen.shape:
+            chosen = chosen.like(Target.of(target))
+        return cls(chosen, cell.shelf, cell.camera, gripper=cell.gripper, draw=draws_from(settings.objects))
 
     def generate(self, seed: int, objects: int, name: str | None = None) -> Scenario:
         """A scenario whose bodies rest on the board, with a target that the detector does not see.
@@ -258,7 +262,8 @@ class ScenarioGenerator:
         x, y, yaw = (float(p) for p in pose)
         turn = (round(float(np.cos(yaw / 2)), 9), 0.0, 0.0, round(float(np.sin(yaw / 2)), 9))
         height = float(self.target.height(self._shelf))
-        return Body(self.target.shape, self.target.half_size, (round(x, 6), round(y, 6), round(height, 6)), turn)
+        place = round(x, 6), round(y, 6), round(height, 6)
+        return Body(self.target.shape, self.target.half_size, place, turn, self.target.compound)
 
     def _hide(self, rng: np.random.Generator, scene: Scenario) -> Scenario | None:
         """The scene with the target at a random hidden pose; None if no drawn pose is hidden, graspable and stable."""
@@ -268,6 +273,8 @@ class ScenarioGenerator:
             polygon = outline(candidate.target)
             if any(separation(polygon, other) <= self.config.gap for other in outlines):
                 continue
+            if self._clearly_shows(candidate):
+                continue
             if self.is_hidden(candidate) and self._graspable(pose) and self.is_at_rest(candidate):
                 return candidate
         return None
@@ -275,11 +282,19 @@ class ScenarioGenerator:
     def _drawn_poses(self, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
         """Random poses for the target, in the order in which they are tried."""
         if not self.config.anywhere:
-            return rng.permutation(self._poses)
+            # A compound has many more yaw angles than a box.
+            tries = len(self._poses) if self.target.compound is None else self.config.target_placements
+            return rng.permutation(self._poses)[:tries]
         low, high = self._poses.min(axis=0), self._poses.max(axis=0)
         # A cylinder looks the same from all sides, a box as after half a turn.
-        low[2], high[2] = 0.0, np.pi if self.target.yaws > 1 else 0.0
+        low[2], high[2] = 0.0, self.target.turn if self.target.yaws > 1 else 0.0
         return rng.uniform(low, high, (self.config.target_placements, 3))
+
+    def _clearly_shows(self, scene: Scenario) -> bool:
+        """Whether a compound shows in a coarse image, which takes a hundredth of the time that `is_hidden` takes."""
+        if self.target.compound is None or self.config.visible:
+            return False
+        return int(target_pixels(self._camera.scaled(COARSE), from_scenario(scene))) > 0
 
     def is_hidden(self, scene: Scenario) -> bool:
         """Whether a scene's target shows no more pixels than `GeneratorConfig.visible`."""

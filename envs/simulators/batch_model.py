@@ -103,8 +103,9 @@ def body_fields(
         fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
 
     fields["geom_friction"] = fields["geom_friction"].at[:, :, 0].multiply(cells.friction[:, None])
-    slots, factors = models.body_geometries(blank, shaped), cells.body_friction[:, shaped.start :, None]
-    fields["geom_friction"] = fields["geom_friction"].at[:, slots, 0].multiply(factors)
+    if shaped:
+        slots, factors = models.body_geometries(blank, shaped), cells.body_friction[:, shaped.start :, None]
+        fields["geom_friction"] = fields["geom_friction"].at[:, slots, 0].multiply(factors)
 
     def put(name: str, where: np.ndarray | int, value: Array) -> None:
         fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))
@@ -128,7 +129,7 @@ def body_fields(
     dof = np.concatenate([np.arange(6) + blank.joint(f"body{i}").dofadr[0] for i in range(BODIES)])
     put("dof_invweight0", dof, jnp.repeat(inverse, 3, axis=-1).reshape(worlds, -1))
 
-    for shape in in_order():
+    for shape in in_order() if shaped else ():
         geom = np.array([blank.geom(models.geometry_name(shape, i)).id for i in shaped])
         used = (valid & (kind == shape.code))[:, shaped.start :]
         half = jnp.where(used[..., None], half_size[:, shaped.start :] - models.MARGIN, models.TINY)

@@ -24,7 +24,16 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.compounds import Matter, Solids
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World, alike, as_compounds, from_scenario
+from mechsearch_jax.envs.world.world import (
+    BODIES,
+    TARGET,
+    CompoundWorld,
+    TargetCompoundWorld,
+    World,
+    alike,
+    as_compounds,
+    from_scenario,
+)
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import CONVEX_CODE, Compound, Piece
@@ -34,7 +43,7 @@ from mechsearch_jax.workspace.scenario import Scenario
 ROWS: Mapping[str, int] = MappingProxyType({"box": 4, "cylinder": 10, "ellipsoid": 2, "capsule": 4})
 _TINY = (2 * models.TINY, 2 * models.TINY, 2 * models.TINY)
 _EMPTY = Compound(tuple(Piece(name, _TINY) for name, count in ROWS.items() for _ in range(count)), 1.0, 1.0)
-# What the slots of all objects hold in the compiled model; the target's is as in the plain one.
+# What the slots of all objects hold in the compiled model; that of a plain target is as in the plain one.
 ROOM: Mapping[int, Compound] = MappingProxyType(dict.fromkeys(range(TARGET), _EMPTY))
 
 
@@ -44,6 +53,16 @@ class CompoundFields(BodyFields):
     geom_pos: jax.Array
     geom_quat: jax.Array
     body_iquat: jax.Array
+
+
+def room_for(world: World) -> Mapping[int, Compound]:
+    """What the slots of a model hold in which worlds have room; nothing in that of plain worlds.
+
+    A target that is a compound is in the model itself, with its meshes: all worlds have the same.
+    """
+    if isinstance(world, TargetCompoundWorld):
+        return {**ROOM, TARGET: world.target}
+    return ROOM if isinstance(world, CompoundWorld) else {}
 
 
 def check_room(world: CompoundWorld) -> None:
@@ -64,20 +83,23 @@ def check_room(world: CompoundWorld) -> None:
             )
 
 
-def fitting(world: World, room: bool) -> World:
+def fitting(world: World, room: Mapping[int, Compound]) -> World:
     """Worlds as a model takes them: plain ones as compounds of a single solid each, if it has room for compounds.
 
     Args:
       world: fields with a leading axis for the worlds.
-      room: whether the model has room for compounds.
+      room: what the model's slots hold, see `room_for`.
 
     Raises:
-      InputError: there are compounds and no room for them, or more solids of a kind than there is room for.
+      InputError: there are compounds and no room for them, or more solids of a kind than there is room for, or the
+        target is another one.
     """
     if not isinstance(world, CompoundWorld):
         return _as_compounds(world) if room else world
     if not room:
         raise InputError("MjxSimulator: there are compounds among plain worlds; run them one set after the other")
+    if room_for(world).get(TARGET) != room.get(TARGET):
+        raise InputError("MjxSimulator: the worlds differ in their target; run them one set after the other")
     check_room(world)
     return world
 
@@ -91,14 +113,14 @@ def like_present(present: World | None, scenario: Scenario) -> World:
     """The world of a scenario, with the leaves of the present worlds.
 
     Raises:
-      InputError: it has compounds, and the present worlds have none.
+      InputError: it has compounds, and the present worlds have none, or its target is another compound.
     """
     first: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], present)
     world = alike([first, from_scenario(scenario)])[1]
     if jax.tree.structure(world) != jax.tree.structure(first):
         raise InputError(
-            f"MjxSimulator: {scenario.name} has compounds, the scenes before it have none; run them one set after the"
-            " other"
+            f"MjxSimulator: {scenario.name} has compounds, the scenes before it have none or another target; run them"
+            " one set after the other"
         )
     return world
 
@@ -148,10 +170,15 @@ def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -
 
 
 def _plain_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -> BodyFields:
-    """`body_fields` with the masses of compounds, and the geometry of the target alone."""
+    """`body_fields` with the masses of compounds, and the geometry of the target alone, if that is no compound."""
     matter = world.compounds.matter
     weights = matter.mass, matter.moments
-    return body_fields(blank, world.kind, world.half_size, world.valid, cells, weights, range(TARGET, TARGET + 1))
+    if not isinstance(world, TargetCompoundWorld):
+        return body_fields(blank, world.kind, world.half_size, world.valid, cells, weights, range(TARGET, TARGET + 1))
+    plain = body_fields(blank, world.kind, world.half_size, world.valid, cells, weights, range(BODIES, BODIES))
+    geoms = np.flatnonzero(models.geometry_slots(blank) == TARGET)
+    friction = plain.geom_friction.at[:, geoms, 0].multiply(cells.body_friction[:, TARGET, None])
+    return plain.replace(geom_friction=friction)
 
 
 def _geoms(blank: mujoco.MjModel) -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ import copy
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool
 
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
-from mechsearch_jax.envs.simulators.compound_batch import ROOM, CompoundFields, compound_fields
+from mechsearch_jax.envs.simulators.compound_batch import CompoundFields, compound_fields
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
 from mechsearch_jax.envs.simulators.warp_streams import keep_streams
@@ -29,6 +30,7 @@ from mechsearch_jax.envs.world.outcome import Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes.compound import Compound
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -97,22 +99,23 @@ class MjxModel:
     """The model that all worlds share, and functions of it.
 
     Attributes:
-      compounds: whether its slots have room for compounds.
+      room: the compounds in its slots, see `compound_batch.room_for`; none in a model of plain worlds.
       blank: the C MuJoCo model with empty slots.
       robot: the robot's configuration at home, shape (9,).
     """
 
-    def __init__(self, shelf: Shelf, camera: Camera, config: MjxConfig, compounds: bool = False):
+    def __init__(
+        self, shelf: Shelf, camera: Camera, config: MjxConfig, room: Mapping[int, Compound] = MappingProxyType({})
+    ):
         """Raises:
         InputError: Warp cannot be imported.
         """
         self._mjx = import_mjx()
         self._config = config
-        self._contacts, self._rows = config.capacity(compounds)
-        self.compounds = compounds
-        self._fields = CompoundFields if compounds else BodyFields
-        slots = ROOM if compounds else {}
-        blank = copy.copy(models.compile_model(shelf, camera, config.simulator.motion.timestep, slots))
+        self._contacts, self._rows = config.capacity(bool(room))
+        self.room = room
+        self._fields = CompoundFields if room else BodyFields
+        blank = copy.copy(models.compile_model(shelf, camera, config.simulator.motion.timestep, room))
         # Warp has no midphase that could be disabled.
         blank.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         # In Warp this flag selects C MuJoCo's box-box collision instead of the general convex one, which in float32

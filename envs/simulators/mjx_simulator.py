@@ -36,7 +36,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of
-from mechsearch_jax.envs.simulators.compound_batch import fitting, like_present
+from mechsearch_jax.envs.simulators.compound_batch import fitting, like_present, room_for
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.simulators.mjx_step import (
     Progress,
@@ -54,7 +54,7 @@ from mechsearch_jax.envs.simulators.mjx_step import (
 from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
-from mechsearch_jax.envs.world.world import CompoundWorld, World, alike, from_scenario
+from mechsearch_jax.envs.world.world import TARGET, World, alike, from_scenario
 from mechsearch_jax.runtime.compiled import Kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program
@@ -136,9 +136,10 @@ class MjxSimulator:
         self._rollout = jax.jit(self._follow, donate_argnums=1)
 
     def _use(self, world: World) -> None:
-        """Have the model that worlds need: that of compounds once there are any, and then for good."""
-        if isinstance(world, CompoundWorld) and not self._model.compounds:
-            self._adopt(MjxModel(self.shelf, self.camera, self.config, compounds=True))
+        """Have the model that worlds need: that of compounds once there are any, and then for all with this target."""
+        room, now = room_for(world), self._model.room
+        if room.get(TARGET) != now.get(TARGET) or (room and not now):
+            self._adopt(MjxModel(self.shelf, self.camera, self.config, room))
 
     def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
         """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`.
@@ -165,7 +166,7 @@ class MjxSimulator:
         world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
         if only is None:
             self._use(world)
-        world = fitting(world, self._model.compounds)
+        world = fitting(world, self._model.room)
         if len(self._cells) != count:
             self._cells = [ASSUMED_CELL] * count
         fields, qpos, ctrl = self._start(world, cells_of(self._model.blank, self._cells))

@@ -11,12 +11,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.pushing.physics_push import THINNEST
-from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.envs.world.compounds import body_at
+from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
 from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.target import Target
 
 # A round superquadric whose exponent e1 is above this is nearer to an ellipsoid than to a cylinder.
 SMOOTH_EXPONENT = 0.6
@@ -78,6 +80,19 @@ def with_parts(
         )
         origins[i] = -centre
     return made, origins
+
+
+def with_target(bodies: Sequence[Body | None], target: Target) -> list[Body | None]:
+    """The bodies with the target, if it is there, as what it is made of.
+
+    Args:
+      bodies: in their slots; that of a compound target the box around it.
+      target: of the search.
+    """
+    made, body = list(bodies), bodies[TARGET]
+    if target.compound is not None and body is not None:
+        made[TARGET] = body_at(target.compound, (body.position, body.quaternion))
+    return made
 
 
 _FIELDS = ("size", "exponents", "position", "rotation", "valid")

@@ -30,10 +30,10 @@ from mechsearch_jax.envs.pushing.physics_push import bodies
 from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
-from mechsearch_jax.envs.trials.compounds import with_parts
+from mechsearch_jax.envs.trials.compounds import with_parts, with_target
 from mechsearch_jax.envs.trials.nearby import Nearby, ScenesNear
 from mechsearch_jax.envs.trials.order import in_order
-from mechsearch_jax.envs.world.world import TARGET, World, bodies_of
+from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, outer_shape
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.planner import Problem
@@ -44,7 +44,6 @@ from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, motions, program
-from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -185,7 +184,7 @@ class NativeTrials:
         objects = jax.tree.map(lambda a: a[row], scenes.objects)
         world = jax.device_get(_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
         friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
-        return world, _at_rest(cell.shelf, simulation, world, objects, friction, mass)
+        return world, _at_rest(cell, simulation, world, objects, friction, mass)
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
@@ -220,7 +219,7 @@ def _world(
     T_world_target = upright_pose(pose, target.height(shelf))
     world = bodies(objects)
     return World(
-        kind=world.kind.at[TARGET].set(shape_of(target.shape).code),
+        kind=world.kind.at[TARGET].set(outer_shape(target).code),
         half_size=world.half_size.at[TARGET].set(jnp.asarray(target.half_size)),
         position=world.position.at[TARGET].set(T_world_target[:3, 3]),
         rotation=world.rotation.at[TARGET].set(T_world_target[:3, :3]),
@@ -229,7 +228,7 @@ def _world(
 
 
 def _at_rest(
-    shelf: Shelf,
+    cell: Cell,
     simulation: SimulatorConfig,
     world: World,
     objects: Superquadrics,
@@ -238,7 +237,7 @@ def _at_rest(
 ) -> TrialScene | None:
     """A scene at rest; None if MuJoCo cannot build it, so that one invalid scene does not end the other trials."""
     try:
-        made, origins = with_parts(bodies_of(world), objects)
-        return TrialScene(shelf, simulation, made, friction, mass, origins)
+        made, origins = with_parts(with_target(bodies_of(world), cell.target), objects)
+        return TrialScene(cell.shelf, simulation, made, friction, mass, origins)
     except (ValueError, mujoco.FatalError):
         return None

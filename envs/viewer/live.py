@@ -24,6 +24,7 @@ import numpy as np
 from mechsearch_jax.envs.page import steps as texts
 from mechsearch_jax.envs.page.ending import Ending
 from mechsearch_jax.envs.page.pictures import Painter, is_known
+from mechsearch_jax.envs.recording.body_solids import body_solids, moved
 from mechsearch_jax.envs.recording.evidence import evidence_without_truth
 from mechsearch_jax.envs.recording.playback import Playback
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording, empty_trace
@@ -31,14 +32,13 @@ from mechsearch_jax.envs.recording.sampled import sampled
 from mechsearch_jax.envs.viewer.shown import ShownStep, shown_step
 from mechsearch_jax.envs.viewer.stage import VISIBLE
 from mechsearch_jax.envs.viewer.viewer import Viewer
-from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.envs.world.world import TARGET, World, outer_shape, with_target
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner.noted_trials import TriedActions
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.session.step import SearchStep
-from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.shapes import in_order
 from mechsearch_jax.viz import drawing, web
-from mechsearch_jax.viz.raycast import Solid
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -194,15 +194,16 @@ def believed_world(scene: Superquadrics, pose: np.ndarray, target: Target, shelf
     x, y, yaw = np.nan_to_num(pose)
     cos, sin = np.cos(yaw), np.sin(yaw)
     stands = (
-        shape_of(target.shape).code,
+        outer_shape(target).code,
         target.half_size,
-        (x, y, shelf.board + target.half_size[2]),
+        (x, y, target.height(shelf)),
         ((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)),
         is_known(pose),
     )
     objects = (kind, scene.size, scene.position, scene.rotation, scene.valid)
     whole = [np.concatenate([np.asarray(a), np.asarray(b)[None]]) for a, b in zip(objects, stands, strict=True)]
-    return World(*whole)  # pyright: ignore[reportArgumentType]
+    world = World(*whole)  # pyright: ignore[reportArgumentType]
+    return jax.tree.map(np.asarray, with_target(world, target))
 
 
 def planned(step: SearchStep, world: World, i: int, begins: float, fps: int) -> Playback:
@@ -234,7 +235,7 @@ def _shown(steps: Sequence[RecordedStep], step: SearchStep) -> ShownStep:
     words |= {} if step.trajectory is not None else {"heading": "nothing to be done"}
     shown = shown_step(recording, len(steps) - 1, step.frame, Painter(recording), words)
     if recorded.world.valid[TARGET]:
-        body = jax.tree.map(lambda a: np.asarray(a)[TARGET], recorded.world)
-        solid = Solid(in_order()[int(body.kind)], body.half_size, body.rotation, body.position, (1.0, 0.0, 0.0))
-        shown.recognised.append(("target", web.mesh_of([solid]), drawing.TARGET, 0.8))
+        pose = (np.asarray(a[TARGET]) for a in (recorded.world.rotation, recorded.world.position))
+        solids = [moved(solid, *pose) for solid in body_solids(recorded.world)[TARGET]]
+        shown.recognised.append(("target", web.mesh_of(solids), drawing.TARGET, 0.8))
     return shown

@@ -9,16 +9,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.recording.film import shelf_solids, slot_colour
+from mechsearch_jax.envs.recording.body_solids import body_solids
+from mechsearch_jax.envs.recording.film import shelf_solids
 from mechsearch_jax.envs.recording.playback import Playback
 from mechsearch_jax.envs.recording.shown_decisions import Ghost
 from mechsearch_jax.envs.viewer.shown import ShownStep
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.robot.arm_clearance import link_poses
-from mechsearch_jax.shapes import in_order
 from mechsearch_jax.viz import drawing, sketches, web
 from mechsearch_jax.viz.panda import panda_pieces
-from mechsearch_jax.viz.raycast import Solid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 from mechsearch_jax.workspace.shelf import Shelf
@@ -137,12 +136,11 @@ class Stage:
     def bodies(self, world: World, played: Playback) -> dict[str, tuple[Any, Pose]]:
         """Show the true bodies of a world; their nodes, with their poses as they are played."""
         nodes: dict[str, tuple[Any, Pose]] = {}
-        for i in np.flatnonzero(world.valid).tolist():
-            shape, half = in_order()[int(world.kind[i])], np.asarray(world.half_size[i])
-            mesh = web.mesh_of([Solid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))])
+        for i, solids in body_solids(world).items():
+            mesh = web.mesh_of(solids)
             name = f"/true/{'target' if i == TARGET else i}"
             pose = Pose.of(played.position[:, i], played.rotation[:, i])
-            nodes[name] = self._mesh(name, mesh, slot_colour(i)), pose
+            nodes[name] = self._mesh(name, mesh, solids[0].colour), pose
         return nodes
 
     def decision(self, i: int, shown: ShownStep, examine: Callable[[int], None]) -> list[Any]:

@@ -171,6 +171,11 @@ def body_of(host: Compounds, slot: int, pose: tuple[Sequence[float], Sequence[fl
     matter: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[slot], host.matter)
     colour = None if np.isnan(matter.colour).any() else tuple(float(c) for c in matter.colour)
     compound = Compound(pieces, float(matter.density), float(matter.friction), colour)  # pyright: ignore
+    return body_at(compound, pose)
+
+
+def body_at(compound: Compound, pose: tuple[Sequence[float], Sequence[float]]) -> Body:
+    """The body of a compound at a pose: position [m] and quaternion (w, x, y, z)."""
     position, quaternion = (tuple(float(v) for v in values) for values in pose)
     return Body(COMPOUND, half_extents(compound), position, quaternion, compound)  # pyright: ignore
 

@@ -13,12 +13,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.world.compounds import Compounds, body_of, compounds_of, with_polyhedra
+from mechsearch_jax.envs.world.compounds import Compounds, body_at, body_of, compounds_of, with_polyhedra
 from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import Shape, in_order, shape_of
+from mechsearch_jax.shapes.compound import COMPOUND, Compound
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
+from mechsearch_jax.workspace.target import Target
 
 TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
@@ -61,6 +63,16 @@ class CompoundWorld(World):
     compounds: Compounds
 
 
+class TargetCompoundWorld(CompoundWorld):
+    """A world whose target is a compound; see `CompoundWorld`.
+
+    Attributes:
+      target: what it is made of. Static: worlds side by side have the same target.
+    """
+
+    target: Compound = flax.struct.field(pytree_node=False)
+
+
 def slots(scenario: Scenario) -> list[Body | None]:
     """The scenario's bodies in the order of a `World`'s slots; None for an empty slot.
 
@@ -74,7 +86,7 @@ def slots(scenario: Scenario) -> list[Body | None]:
 
 
 def from_scenario(scenario: Scenario) -> World:
-    """The world of a scenario: a `CompoundWorld` if it has compounds.
+    """The world of a scenario: a `CompoundWorld` if it has compounds, a `TargetCompoundWorld` if the target is one.
 
     Raises:
       InputError: there are more objects than slots, or a shape that cannot stand beside compounds.
@@ -83,7 +95,7 @@ def from_scenario(scenario: Scenario) -> World:
     bodies = slots(scenario)
     filled = [body or empty for body in bodies]
     world = World(
-        kind=jax.device_put(np.array([_outer_shape(b).code for b in filled], np.int32)),
+        kind=jax.device_put(np.array([outer_shape(b).code for b in filled], np.int32)),
         half_size=jax.device_put(np.array([b.half_size for b in filled], np.float32)),
         position=jax.device_put(np.array([b.position for b in filled], np.float32)),
         rotation=jax.device_put(np.stack([rotation_matrix(b.quaternion) for b in filled]).astype(np.float32)),
@@ -91,10 +103,33 @@ def from_scenario(scenario: Scenario) -> World:
     )
     if not any(body is not None and body.compound for body in bodies):
         return world
-    return CompoundWorld(**_fields(world), compounds=compounds_of(bodies))
+    return _of_compounds(world, bodies)
 
 
-def _outer_shape(body: Body) -> Shape:
+def _of_compounds(world: World, bodies: Sequence[Body | None]) -> CompoundWorld:
+    """A plain world as one of the compounds that the bodies in its slots are."""
+    fields, target = {**_fields(world), "compounds": compounds_of(bodies)}, bodies[TARGET]
+    if target is None or target.compound is None:
+        return CompoundWorld(**fields)
+    return TargetCompoundWorld(**fields, target=target.compound)
+
+
+def with_target(world: World, target: Target) -> World:
+    """A world with the target's pieces, where it has the box around a target that is a compound.
+
+    Args:
+      world: fields without further leading axes.
+      target: of the search.
+    """
+    if target.compound is None or isinstance(world, TargetCompoundWorld):
+        return world
+    bodies = bodies_of(world)
+    bodies[TARGET] = Body(COMPOUND, target.half_size, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), target.compound)
+    return _of_compounds(world, bodies)
+
+
+def outer_shape(body: Body | Target) -> Shape:
+    """The shape whose code a body has in a `World`: of a compound that of the box around it."""
     return in_order()[0] if body.compound else shape_of(body.shape)
 
 
@@ -130,7 +165,7 @@ def as_compounds(world: World) -> CompoundWorld:
     """
     if isinstance(world, CompoundWorld):
         return world
-    return CompoundWorld(**_fields(world), compounds=compounds_of(bodies_of(world)))
+    return _of_compounds(world, bodies_of(world))
 
 
 def bodies_of(world: World) -> list[Body | None]:
@@ -145,8 +180,11 @@ def bodies_of(world: World) -> list[Body | None]:
     made = host.compounds if isinstance(host, CompoundWorld) else None
 
     def body(i: int) -> Body:
+        pose = host.position[i].tolist(), quaternions[i].tolist()
+        if i == TARGET and isinstance(host, TargetCompoundWorld):
+            return body_at(host.target, pose)
         if made is not None and made.compound[i]:
-            return body_of(made, i, (host.position[i].tolist(), quaternions[i].tolist()))
+            return body_of(made, i, pose)
         return Body(
             in_order()[host.kind[i]].name,
             *(tuple(float(v) for v in values) for values in (host.half_size[i], host.position[i])),  # pyright: ignore

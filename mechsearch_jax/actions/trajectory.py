@@ -17,6 +17,7 @@ from mechsearch_jax.geometry.bodies import grasped_shape
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
+from mechsearch_jax.robot.compound_grasps import grip_between
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import (
     Grip,
@@ -119,6 +120,10 @@ def grip_for(problem: Setting, observation: Observation | None, action: Action) 
         shape = grasped_shape(objects, jnp.int32(i), jnp.asarray(action.T_world_gripper)[:3, 3])
         rotation, size, exponents = (np.asarray(a) for a in (shape.rotation, shape.size, shape.exponents))
         return grip_of(closing, rotation, size, exponents, opening)
+    compound = problem.target.compound
+    if what.seen and compound is not None and not (kind.holds_object and i < objects.capacity):
+        T_target_gripper = np.linalg.inv(what.T_world_object) @ np.asarray(action.T_world_gripper, float)
+        return grip_of_any_yaw((*grip_between(compound, T_target_gripper, opening), 0.0), opening)
     if what.seen:
         return grip_of(closing, what.T_world_object[:3, :3], np.array(what.size), np.array(what.exponents), opening)
     x, y, _ = what.size

@@ -20,6 +20,7 @@ from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import FoundGrasps, found_grasps, no_grasps
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.target_view import body_at
 
 
 class Belief(flax.struct.PyTreeNode):
@@ -150,24 +151,21 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
         chance=grid / jnp.maximum(jnp.sum(grid), 1),
         origin=problem.poses[0, :2],
         cell=problem.cell,
-        top=jnp.float32(problem.shelf.board + 2 * problem.target.half_size[2]),
+        top=jnp.float32(problem.shelf.board + problem.target.tall),
     )
 
 
 def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Superquadrics, Bool[Array, " n"]]:
     """The objects and, in one more slot, the target, which is absent until found; and which slot is the target's.
 
-    The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp.
+    The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp. If it is a
+    compound, all are bodies of parts.
     """
     T = belief.grasps.T_world_target
-    target = Superquadrics(
-        size=jnp.float32(problem.target.half_size),
-        exponents=jnp.float32(problem.target.exponents),
-        position=T[:3, 3],
-        rotation=T[:3, :3],
-        valid=belief.found,
-    )
-    if objects.parts is not None:
+    target = body_at(problem.target, T[:3, 3], T[:3, :3], belief.found)
+    if target.parts is not None:
+        objects = with_parts(objects, target.parts.capacity)
+    elif objects.parts is not None:
         target = with_parts(target, objects.parts.capacity)
     everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), objects, target)
     return everything, jnp.arange(everything.capacity) == objects.capacity

@@ -7,6 +7,8 @@ grasps at the observed pose decides.
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -17,16 +19,20 @@ from mechsearch_jax.problem.problem import Problem
 BEYOND = 1.0
 
 
-def nearest_candidate(poses: Float[Array, "x 3"], pose: Float[Array, " 3"]) -> Int[Array, ""]:
-    """Index of the candidate nearest to a pose; poses are x, y [m] and yaw [rad], which repeats after half a turn.
+def nearest_candidate(poses: Float[Array, "x 3"], pose: Float[Array, " 3"], turn: float = math.pi) -> Int[Array, ""]:
+    """Index of the candidate nearest to a pose; poses are x, y [m] and yaw [rad], which repeats after a turn.
 
     Args:
       poses: a grid of positions and yaws.
       pose: of the target.
+      turn: as `Target.turn` [rad]; static.
     """
+    angle = poses[:, 2] - pose[2]
+    if turn != math.pi:
+        angle = angle * (math.pi / turn)
     distance2 = jnp.sum((poses[:, :2] - pose[None, :2]) ** 2, axis=1)
     # On a grid of positions and yaws the weight does not matter, as long as it survives rounding.
-    return jnp.argmin(distance2 + 1e-3 * jnp.sin(poses[:, 2] - pose[2]) ** 2)
+    return jnp.argmin(distance2 + 1e-3 * jnp.sin(angle) ** 2)
 
 
 def candidate_of(problem: Problem, scene: Superquadrics, is_target: Bool[Array, " n"]) -> Bool[Array, " x"]:
@@ -34,7 +40,7 @@ def candidate_of(problem: Problem, scene: Superquadrics, is_target: Bool[Array, 
     slot = jnp.argmax(is_target)
     position, rotation = scene.position[slot], scene.rotation[slot]
     pose = jnp.stack([position[0], position[1], jnp.arctan2(rotation[1, 0], rotation[0, 0])])
-    return jnp.arange(problem.poses.shape[0]) == nearest_candidate(problem.poses, pose)
+    return jnp.arange(problem.poses.shape[0]) == nearest_candidate(problem.poses, pose, problem.target.turn)
 
 
 def beyond_candidates(problem: Problem, position: Float[Array, "n 3"]) -> Bool[Array, " n"]:

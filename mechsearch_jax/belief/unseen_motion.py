@@ -54,7 +54,7 @@ def reopened(
     """
     target = problem.target
     places = problem.poses.reshape(-1, target.yaws, 3)[:, 0, :2]
-    radius = target.half_size[0] if target.yaws == 1 else math.hypot(*target.half_size[:2])
+    radius = target.solid.radius
     now = jnp.any(exists.reshape(-1, target.yaws), axis=1)
     distance2 = jnp.sum((places[:, None] - places[None]) ** 2, axis=-1)
     opened = jnp.zeros_like(now)
@@ -130,7 +130,7 @@ def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, actio
     def sweep(parts, heading, travel):
         points = jnp.concatenate([points.reshape(-1, 3) for points, _ in parts])
         counts = jnp.concatenate([jnp.broadcast_to(c, p.shape[:-1]).reshape(-1) for p, c in parts])
-        return _Sweep(points, counts & (points[:, 2] < shelf.board + 2 * problem.target.half_size[2]), heading, travel)
+        return _Sweep(points, counts & (points[:, 2] < shelf.board + problem.target.tall), heading, travel)
 
     return (
         sweep([(hand_in, True)], forward, ways),

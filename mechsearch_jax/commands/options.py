@@ -14,7 +14,6 @@ import tyro
 
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import check_writable, is_file, is_folder
-from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.episode.method import Method
@@ -26,10 +25,6 @@ if TYPE_CHECKING:
 
 PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
 PushModel = Literal["quasi-static", "learned", "physics"]
-if TYPE_CHECKING:
-    TargetShape = str
-else:
-    TargetShape = Literal[tuple(SHAPES)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,7 +254,6 @@ USUAL_POLICY = OnePolicy()
 
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER|SET ...")]
 
-GivenShape = Annotated[TargetShape | None, tyro.conf.arg(metavar="{" + ",".join(SHAPES) + "}")]
 SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER|SET ...]")]
 ConfigFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mechsearch_jax.commands.given_target import USUAL_TARGET, GivenTarget
 from mechsearch_jax.commands.options import (
     ConfigFile,
-    GivenShape,
     Scenarios,
-    TargetShape,
     at_least_one,
     find_scenarios,
     settings_of,
@@ -22,6 +21,7 @@ from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from mechsearch_jax.problem.settings import Settings
+    from mechsearch_jax.workspace.target import Target
 
 
 def list_sets() -> None:
@@ -39,7 +39,7 @@ def generate(
     scene_set: Annotated[str | None, tyro.conf.arg(name="set", metavar="NAME")] = None,
     out: Path,
     count: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    target: GivenShape = None,
+    hides: Annotated[GivenTarget, tyro.conf.arg(name="")] = USUAL_TARGET,
     seed: Annotated[int | None, tyro.conf.arg(metavar="SEED")] = None,
     config: ConfigFile = None,
 ) -> None:
@@ -50,7 +50,7 @@ def generate(
       scene_set: instead, the name of a set of scenes (mechsearch scenarios list).
       out: folder for the files.
       count: number of scenarios; 1 if not given.
-      target: shape of the target; a cylinder, or what the configuration file says, if not given.
+      hides: the target.
       seed: of the first scenario, 0 if not given; the next ones follow.
       config: a file of settings, of which camera, shelf, gripper, target and objects count.
     """
@@ -59,7 +59,7 @@ def generate(
 
     if (objects is None) == (scene_set is None):
         raise InputError("scenarios generate: give either --objects N or --set NAME, not both")
-    if scene_set is not None and (count, target, seed, config) != (None,) * 4:
+    if scene_set is not None and (hides.given or (count, seed, config) != (None,) * 3):
         raise InputError(
             "scenarios generate: --count, --target and --seed are not for a set, which has its own, nor is --config"
         )
@@ -71,11 +71,11 @@ def generate(
         check_writable(out)
         keep_compilations()
         made = count or 1
-        _generate_more(range(seed or 0, (seed or 0) + made), objects or 0, settings, target, out)
+        _generate_more(range(seed or 0, (seed or 0) + made), objects or 0, settings, hides.load(), out)
     print(f"{made} scenario{'s' if made > 1 else ''} generated: {out}")
 
 
-def _generate_more(seeds: range, objects: int, settings: Settings, target: TargetShape | None, out: Path) -> None:
+def _generate_more(seeds: range, objects: int, settings: Settings, target: str | Target | None, out: Path) -> None:
     from rich.progress import track
 
     from mechsearch_jax.envs.scenes.generator import ScenarioGenerator

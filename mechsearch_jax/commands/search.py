@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mechsearch_jax.commands.given_target import USUAL_TARGET, GivenTarget
 from mechsearch_jax.commands.options import (
     DEFAULTS,
     USUAL_POLICY,
     DecidedBy,
     EpisodeOptions,
-    GivenShape,
     find_scenario,
 )
 from mechsearch_jax.commands.recordings import make_film, make_page
@@ -41,11 +41,11 @@ class Generated:
 
     Attributes:
       objects: instead of a scenario, generate one with so many objects.
-      target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
+      hides: the target.
     """
 
     objects: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    target: Annotated[GivenShape, tyro.conf.arg(help_behavior_hint="")] = None
+    hides: Annotated[GivenTarget, tyro.conf.arg(name="")] = USUAL_TARGET
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +181,7 @@ def search(
 
     if (scenario is None) == (generated.objects is None):
         raise InputError("search: give either a scenario or --objects N, not both")
-    if scenario is not None and generated.target is not None:
+    if scenario is not None and generated.hides.given:
         raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
     options.only_native("search")
     (chosen,) = options.methods(decides.chosen("search"))
@@ -228,4 +228,5 @@ def _scene(
     if scenario is not None:
         loaded = load_scenario(find_scenario(scenario), shelf)
         return lambda: loaded
-    return lambda: ScenarioGenerator.of(settings, generated.target).generate(seed, generated.objects or 0)
+    target = generated.hides.load()
+    return lambda: ScenarioGenerator.of(settings, target).generate(seed, generated.objects or 0)

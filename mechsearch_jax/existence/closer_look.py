@@ -7,7 +7,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.existence.config import ExistenceConfig
@@ -23,6 +22,7 @@ from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import window_image
 
 # Largest number of coarse pixels for which a closer look is made; no target that the detector missed was observed to
 # show more than 12.
@@ -143,14 +143,7 @@ def _pixels(
     grown = nearer * config.step(camera) / scale
     h, w = tables.depth.shape[-2:]
     window = math.ceil(h * grown), math.ceil(w * grown)
-    placed = Superquadrics(
-        size=jnp.float32(target.half_size),
-        exponents=jnp.array(target.exponents, np.float32),
-        position=T_world_target[:3, 3],
-        rotation=T_world_target[:3, :3],
-        valid=jnp.array(True),
-    )
-    target_image = render.object_window(camera.scaled(scale), placed, window)
+    target_image = window_image(camera.scaled(scale), target, T_world_target, window)
     behind, inside = in_window(camera.scaled(scale), closer, target_image.corner, window)
     return jnp.sum(inside & (target_image.depth < behind)) * float(scale**2)
 

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.existence.config import ExistenceConfig
-from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform, upright_pose
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import box_around, extent, framed, surface_cloud, window_image
+
+# Places whose images are computed at once.
+BLOCK = 256
 
 
 class ExistenceTables(flax.struct.PyTreeNode):
@@ -49,29 +52,32 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     T = jax.jit(upright_pose)(np.asarray(places, np.float32), target.height(shelf))
     coarse = camera.scaled(config.step(camera))
     half = np.array(target.half_size, np.float32)
-    window, around = target_window(coarse, half, T)
+    window, around = target_window(coarse, extent(target)[1], framed(target, T))
 
     def view(coarse, pose):
-        placed = Superquadrics(
-            size=jnp.asarray(half),
-            exponents=jnp.array(target.exponents),
-            position=pose[:3, 3],
-            rotation=pose[:3, :3],
-            valid=jnp.array(True),
-        )
-        return render.object_window(coarse, placed, window), render.window_place(coarse, placed, around)[0]
+        first, _ = render.window_place(coarse, box_around(target, pose), around)
+        return window_image(coarse, target, pose, window), first
 
     view_all = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
+    if target.compound is not None:
+        view_all = _in_blocks(view)
     views, first = jax.jit(view_all)(coarse, T)
     depth, corner, first = jax.device_get((views.depth, views.corner, first))
     middle = first[:, 0] + np.array(around, np.int32)[None] // 2
-    sample = jax.jit(superquadric.sample_surface, static_argnames="count")
-    cloud = np.asarray(
-        sample(half - np.float32(config.erosion), np.array(target.exponents, np.float32), count=config.points)
-    )
+    cloud = surface_cloud(target, config.points, config.erosion)
     nearest = depth[:, 0].min(axis=(-1, -2))
     radius = np.float32(np.linalg.norm(half))
     return ExistenceTables(*jax.device_put((T, depth, corner, middle, nearest, cloud.T, radius)))
+
+
+def _in_blocks(view: Callable[[Camera, Array], Any]) -> Callable[[Camera, Array], Any]:
+    """A view at every place (X, S, 4, 4), few at once: the faces of all pieces are tested for every pixel."""
+
+    def view_all(coarse, T):
+        each = jax.lax.map(lambda pose: view(coarse, pose), T.reshape(-1, 4, 4), batch_size=BLOCK)
+        return jax.tree.map(lambda a: a.reshape(*T.shape[:2], *a.shape[1:]), each)
+
+    return view_all
 
 
 def _window_side(extent: float) -> int:

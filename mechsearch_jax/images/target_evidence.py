@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import exponential, matmul, yaw_rotation
-from mechsearch_jax.images.target_pose import LONGEST_STEP, descend, distance
-from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.images.target_pose import LONGEST_STEP, descend, distance, start_yaws
+from mechsearch_jax.shapes.solid import Solid
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -78,7 +78,7 @@ def upright(target: Target, shelf: Shelf, pose: Float[Array, " 3"]) -> Placement
 def away_from(target: Target, placement: Placement, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Signed distance [m] of world points to the surface of the target; NaN for NaN."""
     body = matmul(points - placement.centre[None], placement.rotation)
-    return shape_of(target.shape).distance(body[:, :2], body[:, 2], target.half_size, jnp)
+    return target.solid.distance(body[:, :2], body[:, 2], jnp)
 
 
 def evidence(target: Target, placement: Placement, origin: Float[Array, " 3"], sample: Sample) -> Evidence:
@@ -95,13 +95,11 @@ def evidence(target: Target, placement: Placement, origin: Float[Array, " 3"], s
       origin: the camera's position in the world [m].
       sample: of the image.
     """
-    shape = shape_of(target.shape)
     away = jnp.abs(away_from(target, placement, sample.points))
     start, along = (matmul(a, placement.rotation) for a in ((origin - placement.centre)[None], sample.rays))
     start, along = ([a[..., i] for i in range(3)] for a in (start, along))
-    half_size = np.array(target.half_size)
-    surface = shape.cut(start, along, np.maximum(half_size - OUTLINE, OUTLINE), jnp)
-    outline = shape.cut(start, along, half_size + OUTLINE, jnp)
+    surface = target.solid.cut(start, along, -OUTLINE, jnp)
+    outline = target.solid.cut(start, along, OUTLINE, jnp)
     on_it, inside = away < sample.tolerance, jnp.isfinite(surface)
     through = inside & ~on_it & (sample.depth > surface + sample.tolerance)
     before = inside & ~on_it & (sample.depth < surface)
@@ -112,9 +110,8 @@ def evidence(target: Target, placement: Placement, origin: Float[Array, " 3"], s
 
 def within_shelf(target: Target, placement: Placement, shelf: Shelf) -> Bool[Array, ""]:
     """Whether a target is inside of the shelf, or open before it, but for `INTO_SHELF`."""
-    shape, half_size = shape_of(target.shape), jnp.array(target.half_size)
-    reach = shape.reach(placement.rotation, half_size[None], jnp)
-    low, high = placement.centre - reach, placement.centre + reach
+    against, along = target.solid.extent(placement.rotation, jnp)
+    low, high = placement.centre - against, placement.centre + along
     faces = (low[2] - shelf.board, low[1] - shelf.right, shelf.left - high[1], shelf.back - high[0])
     return jnp.all(jnp.stack([jnp.asarray(face) for face in faces]) > -INTO_SHELF)
 
@@ -144,11 +141,10 @@ def upright_placements(
       points: in the world [m].
       valid: which of them are to be on the target's surface.
     """
-    is_round = shape_of(target.shape).round
     weight, points, middle, outwards = _visible_side(origin, points, valid)
     level = jnp.stack([jnp.stack([-outwards[1], outwards[0]]), outwards[:2]])
-    xy = middle[None, :2] + min(target.half_size[:2]) * matmul(jnp.array(STARTS), level)
-    yaws = jnp.zeros(1) if is_round else jnp.arange(4) * (math.pi / 4)
+    xy = middle[None, :2] + target.solid.breadth * matmul(jnp.array(STARTS), level)
+    yaws = start_yaws(target, 4)
     starts = jnp.concatenate([jnp.repeat(xy, len(yaws), axis=0), jnp.tile(yaws, len(STARTS))[:, None]], axis=1)
     residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
     poses, _ = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
@@ -167,7 +163,7 @@ def tilted_placements(
       valid: which of them are to be on the target's surface.
     """
     weight, points, middle, outwards = _visible_side(origin, points, valid)
-    rotations = jnp.asarray(_tilted(shape_of(target.shape).round), jnp.float32)
+    rotations = jnp.asarray(_tilted(target.solid), jnp.float32)
     centre = middle + 0.65 * min(target.half_size) * outwards
 
     def placed(step: Array, rotation: Array) -> Placement:
@@ -191,13 +187,14 @@ def _visible_side(
     return weight, points, middle, level / jnp.maximum(jnp.sqrt(jnp.sum(level**2) + 1e-12), 1e-6)
 
 
-def _tilted(is_round: bool) -> Float[np.ndarray, "starts 3 3"]:
-    """Rotations to start from: upright, and lying at four angles on the side, on either side if it has two."""
+def _tilted(solid: Solid) -> Float[np.ndarray, "starts 3 3"]:
+    """Rotations to start from: upright, and lying on the side, on either side if it has two: at four angles, or at
+    eight if its ends differ."""
     x, y, z = np.eye(3)
-    laid: list[Any] = [np.stack([y, z, x])] if is_round else [np.stack([y, z, x]), np.stack([z, x, y])]
+    laid: list[Any] = [np.stack([y, z, x])] if solid.round else [np.stack([y, z, x]), np.stack([z, x, y])]
     turns = [
         np.array([[math.cos(a), -math.sin(a), 0.0], [math.sin(a), math.cos(a), 0.0], [0.0, 0.0, 1.0]])
-        for a in np.arange(4) * (math.pi / 4)
+        for a in np.arange(4 if solid.ends_alike else 8) * (math.pi / 4)
     ]
-    standing = turns[:1] if is_round else turns[:2]
+    standing = turns[:1] if solid.round else turns[:2] if solid.turn <= math.pi else turns[::2]
     return np.stack([*standing, *(turn @ rotation for rotation in laid for turn in turns)])

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import yaw_rotation
-from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -24,12 +23,18 @@ LONGEST_STEP = (0.01, 0.01, 0.3)
 
 def distance(target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "p 3"]) -> Float[Array, " p"]:
     """Signed distance [m] of world points to the surface of a target at a pose x, y [m] and yaw [rad]."""
-    shape = shape_of(target.shape)
     level = points[:, :2] - pose[None, :2]
-    if not shape.round:
+    if not target.solid.round:
         R = yaw_rotation(pose[2])
         level = level[:, :1] * R[None, 0, :2] + level[:, 1:] * R[None, 1, :2]
-    return shape.distance(level, points[:, 2] - target.height(shelf), target.half_size, jnp)
+    return target.solid.distance(level, points[:, 2] - target.height(shelf), jnp)
+
+
+def start_yaws(target: Target, count: int) -> Float[Array, " n"]:
+    """Yaws to begin fits with [rad]: `count` over half a turn, twice as many over a full one, one if it is round."""
+    if target.solid.round:
+        return jnp.zeros(1)
+    return jnp.arange(round(count * target.turn / math.pi)) * (math.pi / count)
 
 
 def _cost(residual, weight):
@@ -106,11 +111,11 @@ def target_poses(
     away = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2) + 1e-12), 1e-6)
     across = jnp.stack([-away[1], away[0]])
     # The visible side is nearer to the camera than the centre, by about two thirds of the radius on average.
-    radius = min(target.half_size[:2])
+    radius = target.solid.breadth
     xy = (centre + away * (0.65 * radius))[None] + radius * jnp.array(sides)[:, None] * across[None]
-    yaws = jnp.zeros(1) if shape_of(target.shape).round else jnp.arange(8) * (math.pi / 8)
+    yaws = start_yaws(target, 8)
     starts = jnp.concatenate([jnp.repeat(xy, len(yaws), axis=0), jnp.tile(yaws, len(sides))[:, None]], axis=1)
     residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
     poses, costs = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
-    turned = jnp.zeros_like(costs) if shape_of(target.shape).round else jnp.mod(poses[:, 2], math.pi)
+    turned = jnp.zeros_like(costs) if target.solid.round else jnp.mod(poses[:, 2], target.turn)
     return poses.at[:, 2].set(turned), costs

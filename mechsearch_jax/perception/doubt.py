@@ -17,6 +17,8 @@ from mechsearch_jax.images.cloud import OVERHANG, shelf_view
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.recogniser import Setting
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes.parts import parts_of
+from mechsearch_jax.shapes.solid import Solid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -31,6 +33,8 @@ FACES = 0.012
 FEWEST_RAYS = 20
 # Width of the square inside a round object, relative to its diameter.
 INSCRIBED = 0.7
+# How far a ray has to pass through the inner part of a compound, whose pieces may be thin, in tolerances.
+DEEP = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +92,8 @@ class Doubt(NamedTuple):
         return None
 
 
-class Thing(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Thing:
     """A recognised object or target: name, half-extents [m], whether it is round about z, and its pose in the world."""
 
     name: str
@@ -100,6 +105,51 @@ class Thing(NamedTuple):
     def local(self, vectors: np.ndarray) -> np.ndarray:
         """World directions in its frame."""
         return vectors @ self.rotation
+
+    def gap(self, points: np.ndarray) -> np.ndarray:
+        """Approximate distance of world points from its surface, inside or outside [m]."""
+        local = self.local(points - self.position)
+        past = np.abs(local) - self.size
+        if self.is_round:
+            across = np.hypot(local[:, 0] / self.size[0], local[:, 1] / self.size[1]) - 1.0
+            past = np.stack([across * min(self.size[:2]), past[:, 2]], axis=1)
+        return np.abs(np.linalg.norm(np.maximum(past, 0.0), axis=1) + np.minimum(past.max(axis=1), 0.0))
+
+    def crossed(self, origin: np.ndarray, rays: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays enter and leave its inner part, smaller by about a tolerance [m], in lengths of the rays; they
+        miss it where they would leave it first."""
+        inner = np.maximum(self.size - tolerance, 0.3 * self.size)
+        if self.is_round:
+            inner[:2] *= INSCRIBED
+        start, way = self.local(origin - self.position), self.local(rays)
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        ends = np.sort(np.stack([(-inner - start) / way, (inner - start) / way]), axis=0)
+        return ends[0].max(axis=1), ends[1].min(axis=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CompoundThing(Thing):
+    """A target of several pieces: its largest part as a thing, and all of it where points and rays are judged.
+
+    Attributes:
+      solid: the target's geometry.
+      R_world_target, place: pose of the target.
+    """
+
+    solid: Solid
+    R_world_target: Float[np.ndarray, "3 3"]
+    place: Float[np.ndarray, "3"]
+
+    def gap(self, points: np.ndarray) -> np.ndarray:
+        local = (points - self.place) @ self.R_world_target
+        return np.abs(self.solid.distance(local[:, :2], local[:, 2], np))
+
+    def crossed(self, origin: np.ndarray, rays: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rays cross the inner part where they first enter it, and then for `DEEP` tolerances."""
+        start = (origin - self.place) @ self.R_world_target
+        along = rays @ self.R_world_target
+        enter = self.solid.cut([np.full(len(along), s) for s in start], list(along.T), -tolerance, np)
+        return enter, np.where(np.isfinite(enter), enter + DEEP * tolerance, -np.inf)
 
 
 def recognition_doubt(
@@ -134,7 +184,7 @@ def recognition_doubt(
 
     gap = np.full(len(points), np.inf)
     for thing in things:
-        gap = np.minimum(gap, _surface_distance(thing, thing.local(points - thing.position)))
+        gap = np.minimum(gap, thing.gap(points))
     enough = len(points) >= FEWEST_POINTS
     unexplained = float((gap > tolerance).mean()) if enough else 0.0
     passed = [(_passed(thing, origin, rays, depths, tolerance), thing.name) for thing in things]
@@ -190,29 +240,24 @@ def things_of(shelf: Shelf, target: Target, observation: Observation) -> list[Th
     if bool(observation.target_visible):
         x, y, yaw = np.asarray(observation.target_pose, float)
         turned = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
-        place, is_round = np.array([x, y, target.height(shelf)]), target.exponents[1] > 0.5
-        things.append(Thing("the target", np.array(target.half_size), is_round, turned, place))
+        things.append(_target_thing(target, turned, np.array([x, y, target.height(shelf)])))
     return things
 
 
-def _surface_distance(thing: Thing, points: np.ndarray) -> np.ndarray:
-    """Approximate distance of points in its frame from its surface, inside or outside [m]."""
-    past = np.abs(points) - thing.size
-    if thing.is_round:
-        across = np.hypot(points[:, 0] / thing.size[0], points[:, 1] / thing.size[1]) - 1.0
-        past = np.stack([across * min(thing.size[:2]), past[:, 2]], axis=1)
-    return np.abs(np.linalg.norm(np.maximum(past, 0.0), axis=1) + np.minimum(past.max(axis=1), 0.0))
+def _target_thing(target: Target, rotation: np.ndarray, position: np.ndarray) -> Thing:
+    name = "the target"
+    if target.compound is None:
+        return Thing(name, np.array(target.half_size), target.exponents[1] > 0.5, rotation, position)
+    part = max(parts_of(target.compound), key=lambda part: float(np.prod(part.size)))
+    place = position + rotation @ part.position
+    return CompoundThing(
+        name, part.size, part.exponents[1] > 0.5, rotation @ part.rotation, place, target.solid, rotation, position
+    )
 
 
 def _passed(thing: Thing, origin: np.ndarray, rays: np.ndarray, depths: np.ndarray, tolerance: float) -> float:
     """Share of the rays through the inner part of an object whose measured depth is beyond it."""
-    inner = np.maximum(thing.size - tolerance, 0.3 * thing.size)
-    if thing.is_round:
-        inner[:2] *= INSCRIBED
-    start, way = thing.local(origin - thing.position), thing.local(rays)
-    way = np.where(np.abs(way) < 1e-9, 1e-9, way)
-    ends = np.sort(np.stack([(-inner - start) / way, (inner - start) / way]), axis=0)
-    enter, leave = ends[0].max(axis=1), ends[1].min(axis=1)
+    enter, leave = thing.crossed(origin, rays, tolerance)
     reaches = (enter < leave) & (depths > enter - 3.0 * tolerance)
     if reaches.sum() < FEWEST_RAYS:
         return 0.0

@@ -43,6 +43,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import main_body
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,13 +193,7 @@ def explained_image(
     # An instance beyond the slots has no object.
     image = image.replace(labels=jnp.where(labels < SLOTS, labels, OTHER).astype(labels.dtype))
     place = jnp.stack([pose[0], pose[1], jnp.float32(target.height(shelf))])
-    body = Superquadrics(
-        size=jnp.array([target.half_size], jnp.float32),
-        exponents=jnp.array([target.exponents], jnp.float32),
-        position=place[None],
-        rotation=yaw_rotation(pose[2])[None],
-        valid=has_pixels[None],
-    )
+    body = main_body(target, place[None], yaw_rotation(pose[2])[None], has_pixels[None])
     fitted_target = _FittedTarget(body, pose, on_it)
     return _explain(keys[0], image, fitted_target, (shapes, camera, shelf, refinement), config, least)
 

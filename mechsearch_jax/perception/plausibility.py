@@ -295,8 +295,7 @@ def colour_faults(
         return ()
     pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, seen, jnp.asarray(swapped))
     from_target = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
-    across, _, height = target.half_size
-    whole = 4 * across * height * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2
+    whole = 2 * target.half_size[0] * target.tall * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2
     as_large = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
     if not as_large or (from_target < PATCH_DISTANCE).mean() < PATCH_SHARE:
         return ()

@@ -21,6 +21,7 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.config.config import PlannerConfig
+from mechsearch_jax.geometry.bodies import like_given
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
@@ -133,16 +134,17 @@ def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
         max_num_considered_actions=width(config),
         gumbel_scale=0.0,
     )
-    return _decision(rollout, begin, result, objects.capacity)
+    return _decision(rollout, begin, result, objects)
 
 
-def _decision(rollout: Rollout, begin: Node, result: Any, slots: int) -> Decision:
+def _decision(rollout: Rollout, begin: Node, result: Any, objects: Superquadrics) -> Decision:
     """The decision of a search; an impossible action is never chosen."""
     tree, config = result.search_tree, rollout.config
     child = tree.children_index[0, tree.ROOT_INDEX]
     children = functools.partial(jax.tree.map, lambda a: a[0, jnp.maximum(child, 0)])
     node = tree.embeddings
-    actions, cost, scenes = children(node.action), children(node.cost), children(node.state.scene)
+    actions, cost, slots = children(node.action), children(node.cost), objects.capacity
+    scenes = like_given(children(node.state.scene), objects)
     acted = (child >= 0) & (actions.kind != ActionKind.NONE)
     value = jnp.where(acted, -tree.qvalues(jnp.full(1, tree.ROOT_INDEX))[0], jnp.inf)
     actions = actions.replace(kind=jnp.where(acted, actions.kind, ActionKind.NONE).astype(jnp.int32))
@@ -152,7 +154,8 @@ def _decision(rollout: Rollout, begin: Node, result: Any, slots: int) -> Decisio
     actions, cost, value, scenes = jax.tree.map(lambda a: a[order], (actions, cost, value, scenes))
 
     # In the shapes of sampled sequences: one action each, and fewer of them.
-    nothing, count = no_sequences(config, jax.tree.map(lambda a: a[:slots], begin.state.scene)), width(config)
+    present = like_given(jax.tree.map(lambda a: a[:slots], begin.state.scene), objects)
+    nothing, count = no_sequences(config, present), width(config)
     sequences = nothing.replace(
         actions=jax.tree.map(lambda a, b: b.at[:count, 0].set(a), actions, nothing.actions),
         cost=nothing.cost.at[:count, 0].set(cost),
@@ -166,7 +169,7 @@ def _decision(rollout: Rollout, begin: Node, result: Any, slots: int) -> Decisio
         value=value[0],
         cost=begin.cost,
         predicted_cost=jnp.where(able, cost[0], begin.cost),
-        predicted=jax.tree.map(lambda a, b: jnp.where(able, a[0, :slots], b[:slots]), scenes, begin.state.scene),
+        predicted=jax.tree.map(lambda a, b: jnp.where(able, a[0, :slots], b), scenes, present),
         sequences=sequences,
         refused=jnp.int32(0),
     )

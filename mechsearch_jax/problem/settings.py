@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
@@ -16,8 +17,10 @@ from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
+from mechsearch_jax.shapes.meshes import QUICKLY
+from mechsearch_jax.workspace.compound_file import parse_compound
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
-from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
 
 PLANNER = "planner"
 # Largest coordinate of the base in a file's frame [m].
@@ -88,13 +91,18 @@ _PARTS: Mapping[str, Any] = {
 }
 
 
+# What a target of several pieces is made of, instead of a shape and half-extents, and the defaults.
+_MADE_OF: dict[str, Any] = {"mesh": "", "scale": 1.0, "pieces": [], "density": DENSITY, "friction": FRICTION}
+
+
 def tables() -> dict[str, dict[str, Any]]:
     """Every table and key that a file may have, with its default."""
     parts = {
         name: {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
         for name, usual in _PARTS.items()
     }
-    parts["target"] |= {COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
+    parts["target"].pop("compound")
+    parts["target"] |= _MADE_OF | {COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
 
@@ -191,10 +199,32 @@ def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
 
 def _target(document: Document) -> Target:
     """The target; the defaults of its other keys depend on its shape."""
-    name = document.tables.get("target", {}).get("shape", Target().shape)
+    table = document.tables.get("target", {})
+    if "compound" in table:
+        raise InputError(f"{document.where('target', 'compound')} is unknown; {nearest('compound', list(_MADE_OF))}")
+    made_of = {key: table.get(key, usual) for key, usual in _MADE_OF.items()}
+    rest = {key: value for key, value in table.items() if key not in _MADE_OF}
+    document = dataclasses.replace(document, tables={**document.tables, "target": rest})
+    if made_of["pieces"] or made_of["mesh"]:
+        return with_table(document, "target", _compound_target(document, made_of))
+    name = rest.get("shape", Target().shape)
     shape = checked(name, str, document.where("target", "shape"))
     usual = apply(document, "target", {"shape": shape}, lambda given: Target.of(given.get("shape", Target().shape)))
     return with_table(document, "target", usual)
+
+
+def _compound_target(document: Document, made_of: dict[str, Any]) -> Target:
+    """A target of pieces or of a mesh, as scenario files have them."""
+    where = document.where("target")
+    for key in ("shape", "half_size"):
+        if key in document.tables["target"]:
+            raise InputError(f"{document.where('target', key)}: follows from the mesh or the pieces; leave it out")
+    if made_of["pieces"] and made_of["mesh"]:
+        raise InputError(f"{where}: has pieces and a mesh; give one of them")
+    unused = ("mesh", "scale") if made_of["pieces"] else ("pieces",)
+    value = {key: item for key, item in made_of.items() if key not in unused}
+    compound = parse_compound(value, (), where, Path(document.path).parent, QUICKLY)
+    return apply(document, "target", made_of, lambda _: Target.of_compound(compound))
 
 
 def _with_planner(document: Document, settings: Settings) -> Settings:

@@ -19,6 +19,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.hand import HandEvent
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
+from mechsearch_jax.workspace.compound_file import format_compound
 
 if TYPE_CHECKING:
     from mechsearch_jax.session.step import SearchStep
@@ -97,6 +98,7 @@ def _target(step: SearchStep) -> dict[str, Any]:
     return {
         "shape": target.shape,
         "half_size": list(target.half_size),
+        **({} if target.compound is None else {"pieces": format_compound(target.compound)["pieces"]}),
         "visible": visible,
         "pose": _list(step.observation.target_pose) if visible else None,
         "found": found,

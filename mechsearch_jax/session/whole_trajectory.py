@@ -12,6 +12,7 @@ from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.trajectory import grasped, grip_for, reference_motion, target_pose
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser
@@ -27,6 +28,7 @@ from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part, RobotTrajectory, derivatives
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.placing import PlaceWay, place_ways
+from mechsearch_jax.workspace.target_view import body_at
 
 # Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
 OUTSIDE = 2e-3
@@ -200,7 +202,8 @@ class _Assembly:
         """
         what = grasped(self.problem, self.observation, self.action)
         T_world_gripper = np.asarray(self.action.T_world_gripper, float)
-        ways = place_ways(self.config.place, T_world_gripper, what.T_world_object if what.seen else None, what.size[2])
+        foot = self.problem.target.bottom
+        ways = place_ways(self.config.place, T_world_gripper, what.T_world_object if what.seen else None, foot)
         fault: InputError | None = None
         for way in ways:
             try:
@@ -277,14 +280,10 @@ class _Assembly:
 
     def _target_scene(self, pose: np.ndarray) -> Superquadrics:
         """The target at a pose, as a scene of one object."""
-        T, target = pose[None], self.problem.target
-        return Superquadrics(
-            size=np.array([target.half_size]),  # pyright: ignore[reportArgumentType]
-            exponents=np.array([target.exponents]),  # pyright: ignore[reportArgumentType]
-            position=T[:, :3, 3],  # pyright: ignore[reportArgumentType]
-            rotation=T[:, :3, :3],  # pyright: ignore[reportArgumentType]
-            valid=np.array([True]),  # pyright: ignore[reportArgumentType]
-        )
+        T = pose[None]
+        scene = body_at(self.problem.target, T[:, :3, 3], T[:, :3, :3], np.array([True]))  # pyright: ignore[reportArgumentType]
+        # Boxes around the parts are nearer to it than the one around the whole.
+        return world_parts(scene)
 
     def _held(self) -> Held:
         """What the closed hand holds; a target that is not visible is assumed between the fingers."""

@@ -75,6 +75,17 @@ class Capsule:
             nearest = library.where(hit & (first < nearest), first, nearest)
         return nearest
 
+    def reach(self, direction, half_size, library):
+        radius, half = half_size[..., 0], half_size[..., 2] - half_size[..., 0]
+        return radius + half * library.abs(direction[..., 2])
+
+    def distance(self, level, height, half_size, library):
+        half = half_size[2] - half_size[0]
+        beyond = library.maximum(library.abs(height) - half, 0.0)
+        square = level[..., 0] ** 2 + level[..., 1] ** 2 + beyond**2
+        off_axis = square > 0
+        return library.where(off_axis, library.sqrt(library.where(off_axis, square, 1.0)), 0.0) - half_size[0]
+
     def normal(self, point, half_size, library):
         half = half_size[..., 2:] - half_size[..., :1]
         height = point[..., 2:] - library.clip(point[..., 2:], -half, half)

@@ -52,6 +52,18 @@ class Ellipsoid:
         reach = library.sqrt(library.maximum(1.0 - miss, 0.0) / square)
         return library.where((miss <= 1.0) & (middle - reach > 0.0), middle - reach, library.inf)
 
+    def reach(self, direction, half_size, library):
+        return library.sqrt(library.sum((direction * half_size) ** 2, axis=-1))
+
+    def distance(self, level, height, half_size, library):
+        """Right to first order at the surface; in the middle minus the least semi-axis."""
+        point = [level[..., 0], level[..., 1], height]
+        share = sum((p / a) ** 2 for p, a in zip(point, half_size, strict=True))
+        slope = sum((p / a**2) ** 2 for p, a in zip(point, half_size, strict=True))
+        off = slope > 1e-12
+        gauge, steep = (library.sqrt(library.where(off, value, 1.0)) for value in (share, slope))
+        return library.where(off, gauge * (gauge - 1.0) / steep, -min(half_size))
+
     def normal(self, point, half_size, library):
         return point / half_size**2
 

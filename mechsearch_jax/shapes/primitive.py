@@ -63,6 +63,18 @@ class Primitive(Protocol):
         """Where rays from outside enter it; see `shape.Shape.cut`."""
         ...
 
+    def reach(
+        self, direction: Float[Any, "*batch 3"], half_size: Float[Any, "*other 3"], library: Any
+    ) -> Float[Any, "..."]:
+        """Its support function, from its centre along unit vectors [m]."""
+        ...
+
+    def distance(
+        self, level: Float[Any, "*batch 2"], height: Float[Any, "*batch"], half_size: Sequence[float], library: Any
+    ) -> Float[Any, "*batch"]:
+        """Signed distance of points to its surface [m], negative inside; see `shape.Shape.distance`."""
+        ...
+
     def normal(
         self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
     ) -> Float[Any, "*batch 3"]:

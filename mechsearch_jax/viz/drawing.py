@@ -22,7 +22,6 @@ from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.runtime.files import PathLike, replacing
-from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -204,15 +203,14 @@ def number(axes: Axes, place: tuple[float, float], index: int, animated: bool = 
 def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certain: bool) -> None:
     """Draw the target from above: filled if `certain`, an open outline if the robot does not know its pose."""
     x, y, yaw = (float(v) for v in pose)
-    shape = shape_of(target.shape)
     style = {"edgecolor": TARGET, "linewidth": 1.6, "zorder": 5, "facecolor": TARGET if certain else "none"}
     if not certain:
         style["linestyle"] = (0, (2, 1.5))
-    if shape.round:
-        outline = patches.Circle((y, x), target.half_size[0], **style)
+    if target.solid.round:
+        outline = patches.Circle((y, x), target.solid.radius, **style)
     else:
         c, s = np.cos(yaw), np.sin(yaw)
-        corners = shape.rim(target.half_size) @ np.array([[c, s], [-s, c]]) + (x, y)
+        corners = target.solid.rim() @ np.array([[c, s], [-s, c]]) + (x, y)
         outline = patches.Polygon(corners[:, ::-1], closed=True, **style)
     outline.set_path_effects(halo(1.6))
     axes.add_patch(outline)
@@ -222,8 +220,8 @@ def target_points(pose: Float[np.ndarray, " 3"], target: Target, shelf: Shelf) -
     """Points whose hull is the target, upright on the shelf's board at a pose x, y [m] and yaw [rad]; [m]."""
     x, y, yaw = (float(v) for v in pose)
     c, s = np.cos(yaw), np.sin(yaw)
-    level = shape_of(target.shape).rim(target.half_size) @ np.array([[c, s], [-s, c]]) + (x, y)
-    ends = (shelf.board, shelf.board + 2 * target.half_size[2])
+    level = target.solid.rim() @ np.array([[c, s], [-s, c]]) + (x, y)
+    ends = (shelf.board, shelf.board + target.tall)
     return np.concatenate([np.column_stack([level, np.full(len(level), z)]) for z in ends])
 
 

@@ -22,7 +22,7 @@ from mechsearch_jax.geometry.bodies import bodies_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import read_json, replacing
-from mechsearch_jax.shapes import PRIMITIVES, SHAPES, shape_of
+from mechsearch_jax.shapes import PRIMITIVES, shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
 from mechsearch_jax.shapes.parts import part_rows
 from mechsearch_jax.workspace.compound_file import format_compound, is_compound, parse_compound
@@ -213,8 +213,6 @@ def parse_scenario(value: Any, where: str, shelf: Shelf | None = None, folder: P
             return _body(entry, where, key, shelf)
         if value["version"] == VERSION:
             raise InputError(f'{where}: {key}: bodies of pieces or meshes need "version": {COMPOUND_VERSION}')
-        if key == "target":
-            raise InputError(f"{where}: {key}: must have a shape, one of {', '.join(SHAPES)}; only objects have pieces")
         return _compound_body(entry, where, key, shelf, folder or Path())
 
     objects = tuple(body(b, f"objects[{i}]") for i, b in enumerate(value["objects"]))

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
+from mechsearch_jax.shapes.meshes import QUICKLY, convex_pieces
+from mechsearch_jax.shapes.solid import Solid, Union, Whole
 from mechsearch_jax.workspace.shelf import Shelf
+
+if TYPE_CHECKING:
+    from mechsearch_jax.workspace.scenario import Body
 
 # Largest half-extent and inset [m], and largest number of candidate poses.
 LARGEST = 1.0
 MOST_POSES = 100_000
+# What a target of pieces or of a mesh is made of, if nothing is said: density [kg/m3] and friction.
+DENSITY, FRICTION = 600.0, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,11 +33,12 @@ class Target:
     """An upright target of known shape.
 
     Attributes:
-      shape: name of its shape.
-      half_size: half-extents [m].
+      shape: name of its shape; "compound" of a target of several pieces.
+      half_size: half-extents [m]; of a compound those of the smallest box about its centre of mass.
       grid: number of candidate positions in x and y.
       inset: distance between the outermost candidate positions and the board's edges [m].
-      yaws: number of candidate yaw angles over half a turn; 1 for a round target.
+      yaws: number of candidate yaw angles over a `turn`; 1 for a round target.
+      compound: what a target of several pieces is made of, in the frame of its centre of mass; None for any other.
     """
 
     shape: str = "cylinder"
@@ -33,14 +46,21 @@ class Target:
     grid: tuple[int, int] = (18, 44)
     inset: float = 0.05
     yaws: int = 1
+    compound: Compound | None = None
+
+    def __repr__(self) -> str:
+        # Without a compound as before there were any: the text identifies saved problems and searches.
+        fields = [field.name for field in dataclasses.fields(self) if field.name != "compound" or self.compound]
+        return f"Target({', '.join(f'{name}={getattr(self, name)!r}' for name in fields)})"
 
     def __post_init__(self):
-        shape = shape_of(self.shape, "Target: shape")
         if len(self.half_size) != 3 or not all(0 < s <= LARGEST for s in self.half_size):
             raise InputError(
                 f"Target: half_size {self.half_size} must be three positive lengths in metres, at most {LARGEST}"
             )
-        if fault := shape.fault(self.half_size):
+        if (self.compound is None) == (self.shape == COMPOUND):
+            raise InputError("Target: a compound is made by Target.from_parts, Target.from_mesh or Target.of_body")
+        if self.compound is None and (fault := shape_of(self.shape, "Target: shape").fault(self.half_size)):
             raise InputError(f"Target: half_size {self.half_size}: {fault}")
         if min(self.grid) < 2 or self.yaws < 1:
             raise InputError(
@@ -64,6 +84,77 @@ class Target:
         kind = shape_of(shape)
         return cls(kind.name, half_size or kind.target_half_size, yaws=kind.yaws)
 
+    @classmethod
+    def from_parts(
+        cls,
+        pieces: Sequence[Piece],
+        density: float = DENSITY,
+        friction: float = FRICTION,
+        colour: tuple[float, float, float] | None = None,
+    ) -> Target:
+        """A target of several convex pieces, which stands upright in their frame, z up.
+
+        Args:
+          pieces: at least one; they may overlap.
+          density: [kg/m3].
+          friction: coefficient of sliding friction against anything that is not rougher.
+          colour: red, green and blue, 0 to 1; None for the target's usual colour.
+
+        Raises:
+          InputError: there are no pieces, or the target is too large.
+        """
+        if not pieces:
+            raise InputError("Target: a target of pieces needs at least one")
+        return cls.of_compound(Compound(tuple(pieces), density, friction, colour))
+
+    @classmethod
+    def from_mesh(
+        cls,
+        path: str | os.PathLike[str],
+        scale: float = 1.0,
+        density: float = DENSITY,
+        friction: float = FRICTION,
+        colour: tuple[float, float, float] | None = None,
+    ) -> Target:
+        """A target of the shape of a mesh file (OBJ, STL or PLY), which stands upright in its frame, z up.
+
+        Args:
+          path: of the file; see `shapes.meshes.convex_pieces`.
+          scale: metres per unit of the file.
+          density, friction, colour: as of `from_parts`.
+
+        Raises:
+          InputError: the file cannot be read, is no solid mesh, or is too large.
+        """
+        return cls.from_parts(convex_pieces(Path(path), scale, "Target: mesh", QUICKLY), density, friction, colour)
+
+    @classmethod
+    def of_body(cls, body: Body) -> Target:
+        """The target that a scenario's body is, with the usual candidate poses.
+
+        Raises:
+          InputError: as `of`.
+        """
+        return cls.of(body.shape, body.half_size) if body.compound is None else cls.of_compound(body.compound)
+
+    @classmethod
+    def of_compound(cls, compound: Compound) -> Target:
+        """The target that a compound is, which stands upright in its frame, z up.
+
+        Raises:
+          InputError: it is too large.
+        """
+        compound, _ = centred(compound)
+        return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
+
+    def like(self, other: Target) -> Target:
+        """Another target with this one's grid and inset.
+
+        It has this target's yaw angles if it is of the same shape and of the same turn, else its own.
+        """
+        same = self.shape == other.shape and self.solid.round == other.solid.round and self.turn == other.turn
+        return dataclasses.replace(other, grid=self.grid, inset=self.inset, yaws=self.yaws if same else other.yaws)
+
     def resized(self, shape: str, half_size: tuple[float, float, float]) -> Target:
         """A target of a shape and half-extents [m] with this one's grid and inset.
 
@@ -72,9 +163,7 @@ class Target:
         Raises:
           InputError: as `of`.
         """
-        other = Target.of(shape, half_size)
-        yaws = self.yaws if other.shape == self.shape else other.yaws
-        return dataclasses.replace(other, grid=self.grid, inset=self.inset, yaws=yaws)
+        return self.like(Target.of(shape, half_size))
 
     @classmethod
     def cylinder(cls) -> Target:
@@ -86,11 +175,37 @@ class Target:
 
     @property
     def exponents(self) -> tuple[float, float]:
-        return shape_of(self.shape).exponents
+        """Of the superquadric that represents it in plans; of a compound, whose parts do, of a box around it."""
+        return shape_of("box" if self.compound else self.shape).exponents
+
+    @property
+    def solid(self) -> Solid:
+        """Its geometry."""
+        return Union(self.compound) if self.compound else Whole(shape_of(self.shape), self.half_size)
+
+    @property
+    def turn(self) -> float:
+        """The yaw after which it looks the same [rad]: half a turn, or a full one."""
+        return self.solid.turn
+
+    @property
+    def bottom(self) -> float:
+        """How far its lowest point is below its centre [m]."""
+        return self.solid.bottom
+
+    @property
+    def top(self) -> float:
+        """How far its highest point is above its centre [m]."""
+        return self.solid.top
+
+    @property
+    def tall(self) -> float:
+        """Its height [m]."""
+        return self.bottom + self.top
 
     def height(self, shelf: Shelf) -> float | Array:
         """z of the centre of a target that stands on the board [m]; the shelf may be traced."""
-        return shelf.board + self.half_size[2]
+        return shelf.board + self.bottom
 
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
         """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.
@@ -99,7 +214,7 @@ class Target:
         """
         x = np.linspace(shelf.front + self.inset, shelf.back - self.inset, self.grid[0])
         y = np.linspace(shelf.right + self.inset, shelf.left - self.inset, self.grid[1])
-        yaw = np.arange(self.yaws) * np.pi / self.yaws
+        yaw = np.arange(self.yaws) * self.turn / self.yaws
         return np.stack(np.meshgrid(x, y, yaw, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
 
     def places(self, shelf: Shelf, shares: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "x s 3"]:
@@ -114,7 +229,7 @@ class Target:
         """
         poses = self.candidate_poses(shelf)
         offsets = np.tile(shares * np.array(self.cell(shelf), np.float32) / 2, (len(poses), 1, 1))
-        outward = max(self.inset - min(self.half_size[:2]), 0.0)
+        outward = max(self.inset - self.solid.breadth, 0.0)
         for axis, side in ((0, 1.0), (1, 1.0), (1, -1.0)):
             outermost = poses[:, axis] * side == np.max(poses[:, axis] * side)
             offsets[np.ix_(outermost, shares[:, axis] == side, [axis])] = side * outward
@@ -125,5 +240,5 @@ class Target:
         return (
             (shelf.back - shelf.front - 2 * self.inset) / (self.grid[0] - 1),
             (shelf.left - shelf.right - 2 * self.inset) / (self.grid[1] - 1),
-            np.pi / self.yaws if self.yaws > 1 else 0.0,
+            self.turn / self.yaws if self.yaws > 1 else 0.0,
         )

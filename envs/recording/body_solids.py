@@ -1,0 +1,118 @@
+"""The bodies of a world as solids that pictures and the viewer can show: of a compound each of its solids."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.envs.camera.simulated_camera import PALETTE
+from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World, bodies_of
+from mechsearch_jax.shapes import PRIMITIVES, in_order
+from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, hull, solids, surface_points
+from mechsearch_jax.viz.raycast import Colour, Solid
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Polyhedron:
+    """A convex polyhedron as a surface of pictures, whatever half-extents are said.
+
+    Attributes:
+      piece: of a compound.
+      planes: its half-spaces n . x <= d in its own frame, as rows (n, d).
+    """
+
+    piece: Piece
+    planes: Float[np.ndarray, "n 4"]
+
+    def cut(
+        self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
+    ) -> Float[Any, "*rays"]:
+        """See `shapes.Shape.cut`."""
+        near, far = library.full_like(direction[0], -np.inf), library.full_like(direction[0], np.inf)
+        for x, y, z, reach in self.planes.tolist():
+            along = x * direction[0] + y * direction[1] + z * direction[2]
+            height = reach - x * origin[0] - y * origin[1] - z * origin[2]
+            safe = library.where(library.abs(along) < 1e-12, 1e-12, along)
+            where = height / safe
+            near = library.where(safe < 0.0, library.maximum(near, where), near)
+            far = library.where(safe > 0.0, library.minimum(far, where), far)
+        return library.where((near <= far) & (near > 0.0), near, np.inf)
+
+    def normal(
+        self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
+    ) -> Float[Any, "*batch 3"]:
+        """See `shapes.Shape.normal`."""
+        above = point @ self.planes[:, :3].T - self.planes[:, 3]
+        return self.planes[:, :3][library.argmax(above, axis=-1)]
+
+    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
+        """Its surface in its own frame."""
+        return hull(self.piece).copy()
+
+
+def slot_colour(index: int) -> Colour:
+    """The colour of a body's slot, or of the shelf."""
+    red, green, blue = (float(c) for c in PALETTE[index])
+    return red, green, blue
+
+
+def body_solids(world: World) -> dict[int, list[Solid]]:
+    """The solids of the bodies that are there, by slot, each in the frame of its body.
+
+    Args:
+      world: NumPy arrays without leading axes.
+    """
+    bodies = bodies_of(world) if isinstance(world, CompoundWorld) else [None] * BODIES
+    shown = {}
+    for i in np.flatnonzero(world.valid).tolist():
+        body = bodies[i]
+        if body is not None and body.compound is not None:
+            shown[i] = _of_compound(body.compound, i)
+        else:
+            shape, half = in_order()[int(world.kind[i])], np.asarray(world.half_size[i])
+            shown[i] = [Solid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))]
+    return shown
+
+
+def _of_compound(compound: Compound, slot: int) -> list[Solid]:
+    colour = slot_colour(slot) if slot == TARGET else compound.colour or slot_colour(slot)
+    return [
+        Solid(_surface(solid), _half(solid), solid.rotation, np.array(solid.position), colour)
+        for solid in solids(compound.pieces)
+    ]
+
+
+def _surface(solid: Piece) -> Any:
+    return Polyhedron(solid, faces(solid)) if solid.shape == CONVEX else PRIMITIVES[solid.shape]
+
+
+def _half(solid: Piece) -> Float[np.ndarray, " 3"]:
+    """Half-extents of a solid about its centre [m]."""
+    return np.abs(np.array(solid.vertices)).max(axis=0) if solid.shape == CONVEX else np.array(solid.half_size)
+
+
+def moved(solid: Solid, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"]) -> Solid:
+    """A solid in the world, from that in the frame of its body, which has a pose."""
+    return dataclasses.replace(solid, rotation=rotation @ solid.rotation, position=rotation @ solid.position + position)
+
+
+def body_points(world: World) -> dict[int, Float[np.ndarray, "points 3"]]:
+    """Points whose hull contains each body that is there, by slot, in its own frame [m]; see `body_solids`."""
+    bodies = bodies_of(world) if isinstance(world, CompoundWorld) else [None] * BODIES
+    points = {}
+    for i in np.flatnonzero(world.valid).tolist():
+        body = bodies[i]
+        if body is not None and body.compound is not None:
+            points[i] = surface_points(body.compound)
+        else:
+            half = [float(h) for h in world.half_size[i]]
+            level = in_order()[int(world.kind[i])].rim(half)
+            points[i] = np.concatenate([np.column_stack([level, np.full(len(level), z)]) for z in (-half[2], half[2])])
+    return points

@@ -1,0 +1,265 @@
+"""Grasps of a compound from the side: where two opposite sides of it are near enough for the fingers to close on.
+
+A closing is a line between the fingers, level and across the approach. On lines in several directions, at several
+heights and depths, the body's sections that fit between the fingers are candidates. A closing counts where the pads of
+the closed fingers meet material that faces them, opposite each other, and where the open gripper touches the body
+nowhere on its straight way in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mechsearch_jax.robot.gripper import FINGER, Gripper, Primitive, primitives_in_gripper
+from mechsearch_jax.shapes.compound import Compound
+from mechsearch_jax.shapes.field import Field, field_of
+from mechsearch_jax.shapes.solid import surface
+
+# Directions of the approach over a full turn, and the most closings of a body.
+DIRECTIONS, MOST = 24, 16
+# Heights of closings, least distance from the body's lowest and highest points, and steps of the depth along the
+# approach and along a line [m].
+HEIGHTS, FROM_ENDS, DEPTH, ALONG = 7, 0.012, 0.008, 0.001
+# Half the width of a finger's pad, and how far it reaches before and behind the line [m]; lines across it either way.
+PAD, PAD_FRONT, PAD_BACK, PAD_LINES = 0.0095, 0.006, 0.012, 5
+# Surface this far from where a pad comes to rest touches it [m]; the least share of the pads' lines that do; and the
+# largest angles between the closing direction and the surface's normal there, and the line of the forces [rad].
+TOUCH, LEAST_CONTACT, FACING, ALIGNED = 0.0015, 0.12, math.radians(24), math.radians(20)
+# Share of the lines that touch beyond which more gain nothing.
+ENOUGH = 0.5
+# Points of the body's surface that the open gripper must not meet, and how deep they may be in it [m].
+BODY_POINTS, SLACK = 1500, 0.0015
+# What a closing loses for each metre from the vertical axis through the centre of mass, and from the usual height.
+OFF_AXIS, OFF_HEIGHT = 3.0, 3.0
+# The angle by which the gripper points down where the pads are tried [rad].
+USUAL_TILT = math.radians(25)
+# Closings nearer than this in direction [rad] and place [m] are alike.
+ALIKE, ALIKE_PLACE = math.radians(10), 0.012
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Closings:
+    """Lines on which the fingers close on a body.
+
+    Attributes:
+      yaw: direction of the approach, seen from above [rad], shape (c,).
+      point: the middle between the fingers, in the body's frame [m], shape (c, 3).
+      tilts: indices of the angles by which the gripper may point down, for each.
+    """
+
+    yaw: Float[np.ndarray, " c"]
+    point: Float[np.ndarray, "c 3"]
+    tilts: tuple[tuple[int, ...], ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Line:
+    """A candidate: its yaw [rad], its middle [m], and how good it is."""
+
+    yaw: float
+    point: np.ndarray
+    score: float
+
+
+def axes(yaw: float, tilt: float) -> Float[np.ndarray, "3 3"]:
+    """The gripper's axes as columns: as `grasp_frames.gripper_rotation`, in double precision."""
+    c, s, cosine, sine = math.cos(yaw), math.sin(yaw), math.cos(tilt), math.sin(tilt)
+    return np.array([[c * sine, s, c * cosine], [s * sine, -c, s * cosine], [cosine, 0.0, -sine]])
+
+
+def closings(
+    compound: Compound, gripper: Gripper, yaws: Sequence[float] | None, tilts: Sequence[float], height: float
+) -> Closings:
+    """The best different closings on a compound, at most `MOST`.
+
+    Args:
+      compound: centred.
+      gripper: that grasps.
+      yaws: directions of the approach of a solid of revolution [rad]; None for any other body, which is tried in
+        `DIRECTIONS` directions.
+      tilts: angles by which the gripper points down [rad].
+      height: usual height above the centre of mass [m].
+    """
+    field = field_of(compound)
+    body = surface(compound, BODY_POINTS)
+    if yaws is not None:
+        angles = list(yaws)[:: math.ceil(len(yaws) / MOST)]
+        single = _chosen(_lines(field, gripper, [0.0], height), gripper, body, tilts, max(MOST // len(angles), 1))
+        return _turned(single, angles)
+    angles = [2 * math.pi * i / DIRECTIONS for i in range(DIRECTIONS)]
+    return _chosen(_lines(field, gripper, angles, height), gripper, body, tilts, MOST)
+
+
+def _turned(single: Closings, angles: Sequence[float]) -> Closings:
+    """Closings of yaw 0 about the vertical axis, at each of several angles [rad]."""
+    turns = [axes(angle, 0.0)[:, [2, 1, 0]] * [1.0, -1.0, 1.0] for angle in angles]
+    return Closings(
+        np.repeat(np.array(angles), len(single.yaw)),
+        np.concatenate([single.point @ turn.T for turn in turns]),
+        single.tilts * len(angles),
+    )
+
+
+def _lines(field: Field, gripper: Gripper, angles: Sequence[float], height: float) -> list[_Line]:
+    """All candidates, the best first."""
+    low, high = _ends(field)
+    heights = np.linspace(low + FROM_ENDS, max(high - FROM_ENDS, low + FROM_ENDS), HEIGHTS)
+    usual = min(height, 0.6 * high)
+    found = [line for yaw in angles for z in (*heights, usual) for line in _at_height(field, gripper, yaw, z, usual)]
+    return sorted(found, key=lambda line: -line.score)
+
+
+def _ends(field: Field) -> tuple[float, float]:
+    """The least and the largest height of the body [m]."""
+    inside = np.nonzero((field.values < 0.0).any(axis=(0, 1)))[0]
+    return tuple(float(field.low[2] + field.step * i) for i in (inside[0], inside[-1]))  # pyright: ignore[reportReturnType]
+
+
+def _at_height(field: Field, gripper: Gripper, yaw: float, z: float, usual: float) -> Iterator[_Line]:
+    """The candidates of a direction and a height."""
+    ahead, across = axes(yaw, 0.0)[:, 2], axes(yaw, 0.0)[:, 1]
+    reach = float(np.linalg.norm(np.maximum(np.abs(field.low[:2]), np.abs(field.high[:2]))))
+    depths, lateral = np.arange(-reach, reach, DEPTH), np.arange(-reach, reach, ALONG)
+    points = depths[:, None, None] * ahead + lateral[None, :, None] * across + np.array([0.0, 0.0, z])
+    material = field.at(points) < 0.0
+    for row, depth in zip(material, depths, strict=True):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
+        starts, stops = edges[::2], edges[1::2]
+        for i in range(len(starts)):
+            for j in range(i, len(starts)):
+                first, last = lateral[starts[i]], lateral[stops[j] - 1]
+                if last - first > gripper.usable_opening:
+                    continue
+                point = depth * ahead + 0.5 * (first + last) * across + np.array([0.0, 0.0, z])
+                if (closing := _closing(field, gripper, yaw, point, usual)) is not None:
+                    yield closing
+
+
+def _pad_lines(R_body_gripper: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "l 3"]:
+    """Where lines across the pads start from the point between the finger tips [m]."""
+    x, _, z = R_body_gripper.T
+    wide, deep = np.linspace(-PAD, PAD, PAD_LINES), np.linspace(-PAD_BACK, PAD_FRONT, PAD_LINES)
+    return (wide[:, None, None] * x + deep[None, :, None] * z).reshape(-1, 3)
+
+
+def between(
+    field: Field, R_body_gripper: Float[np.ndarray, "3 3"], point: Float[np.ndarray, " 3"], opening: float
+) -> tuple[Float[np.ndarray, "l 2"], Float[np.ndarray, "l 3"]]:
+    """What is between open fingers: the first and last material on lines across the pads, from the middle of the
+    fingers, NaN where there is none [m]; and where the lines start [m]."""
+    across = R_body_gripper[:, 1]
+    starts = point + _pad_lines(R_body_gripper)
+    lateral = np.arange(-opening / 2, opening / 2 + ALONG / 2, ALONG)
+    material = field.at(starts[:, None] + lateral[None, :, None] * across) < 0.0
+    there = material.any(axis=1)
+    ends = np.stack([lateral[material.argmax(axis=1)], lateral[::-1][material[:, ::-1].argmax(axis=1)]], axis=1)
+    return np.where(there[:, None], ends, np.nan), starts
+
+
+def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], opening: float) -> tuple[float, float]:
+    """Half of the width of what is between open fingers [m]: on the widest line across the pads, and between the pads
+    as they come to rest; 0 where there is nothing."""
+    ends, _ = between(field_of(compound), T_body_gripper[:3, :3], T_body_gripper[:3, 3], opening)
+    if np.isnan(ends).all():
+        return 0.0, 0.0
+    return float(np.nanmax(ends[:, 1] - ends[:, 0])) / 2, float(np.nanmax(ends[:, 1]) - np.nanmin(ends[:, 0])) / 2
+
+
+def _closing(field: Field, gripper: Gripper, yaw: float, point: np.ndarray, usual: float) -> _Line | None:
+    """The candidate at a point, moved to the middle between the closed pads; None if the fingers do not hold there."""
+    R = axes(yaw, USUAL_TILT)
+    across = R[:, 1]
+    ends, starts = between(field, R, point, gripper.max_opening)
+    if np.isnan(ends).all():
+        return None
+    rest = np.array([np.nanmin(ends[:, 0]), np.nanmax(ends[:, 1])])
+    if rest[1] - rest[0] > gripper.usable_opening:
+        return None
+    touching = [np.abs(ends[:, side] - rest[side]) < TOUCH for side in (0, 1)]
+    share = min(float(touch.mean()) for touch in touching)
+    if share < LEAST_CONTACT:
+        return None
+    middles = []
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        places = starts[touching[side]] + ends[touching[side], side, None] * across
+        facing = field.slope(places + sign * 0.001 * across) @ (sign * across)
+        if float(np.median(facing)) < math.cos(FACING):
+            return None
+        middles.append(places.mean(axis=0))
+    force = middles[1] - middles[0]
+    if force @ across < math.cos(ALIGNED) * float(np.linalg.norm(force)):
+        return None
+    centre = point + 0.5 * float(rest.sum()) * across
+    off_axis, off_height = float(np.linalg.norm(centre[:2])), abs(float(centre[2]) - usual)
+    return _Line(yaw, centre, min(share, ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
+
+
+def _chosen(
+    lines: list[_Line], gripper: Gripper, body: Float[np.ndarray, "n 3"], tilts: Sequence[float], most: int
+) -> Closings:
+    """The best lines that differ, and that the open gripper reaches at some tilt; every direction has its turn."""
+    chosen: list[_Line] = []
+    allowed: list[tuple[int, ...]] = []
+    boxes = _boxes(gripper)
+    left = list(lines)
+    used: dict[float, int] = {}
+    while left and len(chosen) < most:
+        # The direction with the fewest closings is served first, by its best line.
+        line = min(left, key=lambda line: (used.get(line.yaw, 0) + _crowd(line, chosen), -line.score))
+        left.remove(line)
+        if any(_alike(line, other) for other in chosen):
+            continue
+        free = tuple(i for i, tilt in enumerate(tilts) if not _meets(line, tilt, body, boxes))
+        if free:
+            chosen.append(line)
+            allowed.append(free)
+            used[line.yaw] = used.get(line.yaw, 0) + 1
+    return Closings(
+        np.array([line.yaw for line in chosen]),
+        np.array([line.point for line in chosen]).reshape(-1, 3),
+        tuple(allowed),
+    )
+
+
+def _crowd(line: _Line, chosen: list[_Line]) -> int:
+    """Number of chosen lines of nearly the same direction."""
+    return sum(math.cos(line.yaw - other.yaw) > math.cos(math.radians(20)) for other in chosen)
+
+
+def _alike(a: _Line, b: _Line) -> bool:
+    near = float(np.linalg.norm(a.point - b.point)) < ALIKE_PLACE
+    return near and math.cos(a.yaw - b.yaw) > math.cos(ALIKE)
+
+
+def _boxes(gripper: Gripper) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Boxes in or around the hand's and the open fingers' primitives: half-extents [m], and pose in the gripper frame.
+
+    Links 6 and 7 are behind the hand, beyond the reach of a body between the fingers.
+    """
+    primitives: Sequence[Primitive] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
+    return [(np.maximum(np.array(p.size) - SLACK, 1e-3), p.T_frame_primitive) for p in primitives]
+
+
+def _meets(
+    line: _Line, tilt: float, body: Float[np.ndarray, "n 3"], boxes: list[tuple[np.ndarray, np.ndarray]]
+) -> bool:
+    """Whether the open gripper meets the body on its straight way in: the way of each surface point, seen from the
+    gripper, ends at it and begins far ahead of it."""
+    local = (body - line.point) @ axes(line.yaw, tilt)
+    return any(_swept(local, half, T).any() for half, T in boxes)
+
+
+def _swept(points: Float[np.ndarray, "n 3"], half: np.ndarray, T: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Which points a box has passed through that came along its frame's z from far behind."""
+    origin = (points - T[:3, 3]) @ T[:3, :3]
+    along = T[2, :3]
+    safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
+    a, b = (-half - origin) / safe, (half - origin) / safe
+    near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    # The point's way relative to the gripper: from far ahead (+z) down to where it is.
+    return (near <= far) & (far >= 0.0)

@@ -1,0 +1,218 @@
+"""The geometry of a compound as the union of its convex solids, for NumPy or JAX; without JAX.
+
+Distances and cuts are the least of the solids', support functions the largest. Outside of a solid with edges a distance
+may be less than the true one, but not on its surface or inside: that of a convex polyhedron is to the farthest of the
+planes of its faces, that of an ellipsoid is right to first order.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, solids
+from mechsearch_jax.shapes.registry import PRIMITIVES
+
+# A solid is shrunk to no less than this share of its half-extents.
+LEAST_SHARE = 0.5
+# Beyond every plane of a body [m]: the planes that fill up the rows of polyhedra with fewer faces.
+_FAR = 1e3
+
+
+class Polyhedra(NamedTuple):
+    """The convex polyhedra of a compound as half-spaces n . x <= d in its frame.
+
+    Attributes:
+      normal: shape (P, F, 3).
+      offset: d, shape (P, F) [m]; rows of polyhedra with fewer faces are filled up with planes far away.
+      depth: distance of the planes from the middle of the polyhedron's vertices, shape (P, F) [m].
+    """
+
+    normal: Float[np.ndarray, "p f 3"]
+    offset: Float[np.ndarray, "p f"]
+    depth: Float[np.ndarray, "p f"]
+
+
+@functools.lru_cache(maxsize=256)
+def _solids(compound: Compound) -> tuple[Piece, ...]:
+    return tuple(solids(compound.pieces))
+
+
+@functools.lru_cache(maxsize=256)
+def _primitives(compound: Compound) -> tuple[Piece, ...]:
+    return tuple(solid for solid in _solids(compound) if solid.shape != CONVEX)
+
+
+@functools.lru_cache(maxsize=256)
+def polyhedra(compound: Compound) -> Polyhedra | None:
+    """Its convex polyhedra, None without any; the arrays must not be changed."""
+    pieces = [solid for solid in _solids(compound) if solid.shape == CONVEX]
+    if not pieces:
+        return None
+    rows = [faces(piece) for piece in pieces]
+    shape = (len(rows), max(len(row) for row in rows))
+    normal, offset, depth = np.zeros((*shape, 3)), np.full(shape, _FAR), np.full(shape, _FAR)
+    for i, (piece, row) in enumerate(zip(pieces, rows, strict=True)):
+        turned = row[:, :3] @ piece.rotation.T
+        middle = piece.in_body(np.array(piece.vertices)).mean(axis=0)
+        normal[i, : len(row)] = turned
+        offset[i, : len(row)] = row[:, 3] + turned @ np.array(piece.position)
+        depth[i, : len(row)] = offset[i, : len(row)] - turned @ middle
+    return Polyhedra(normal, offset, depth)
+
+
+def _local(vector: Sequence[Any], piece: Piece, place: bool) -> list[Any]:
+    """Components in a piece's frame of a point, if `place`, or a direction in the body's."""
+    R, t = piece.rotation, piece.position
+    moved = [component - t[i] if place else component for i, component in enumerate(vector)]
+    return [sum(moved[j] * float(R[j, i]) for j in range(3)) for i in range(3)]
+
+
+def _half(piece: Piece, grown: float) -> np.ndarray:
+    half = np.array(piece.half_size)
+    return half + grown if grown >= 0.0 else np.maximum(half + grown, LEAST_SHARE * half)
+
+
+def _offset(rows: Polyhedra, grown: float) -> np.ndarray:
+    return rows.offset + (grown if grown >= 0.0 else np.maximum(grown, -LEAST_SHARE * rows.depth))
+
+
+def _least(values: list[Any], library: Any) -> Any:
+    least, *rest = values
+    for value in rest:
+        least = library.minimum(least, value)
+    return least
+
+
+def _fold(step: Callable[[Any, Any], Any], start: Any, rows: tuple[np.ndarray, ...], library: Any) -> Any:
+    """A step over the faces of all polyhedra, one face of each at a time.
+
+    The points or rays are the innermost axis of everything in it: on a CPU thirty times as fast as a reduction over the
+    faces of each of them.
+
+    Args:
+      step: of a state and the rows of a face.
+      start: the first state.
+      rows: arrays (P, F, ...).
+      library: of the arrays.
+    """
+    by_face = tuple(np.swapaxes(row, 0, 1) for row in rows)
+    if library is np:
+        state = start
+        for face in zip(*by_face, strict=True):
+            state = step(state, face)
+        return state
+    # Only for arrays of JAX, which is loaded then.
+    import jax
+
+    cast = tuple(library.asarray(row, library.float32) for row in by_face)
+    return jax.lax.scan(lambda state, face: (step(state, face), None), start, cast)[0]
+
+
+def _product(normal: Float[Any, "p 3"], vector: Sequence[Any]) -> Any:
+    """Products of the normals with vectors, shape (P, *batch)."""
+    lead = (-1, *[1] * vector[0].ndim)
+    return sum(component[None] * normal[:, i].reshape(lead) for i, component in enumerate(vector))
+
+
+def _along(row: Float[Any, " p"], vector: Sequence[Any]) -> Any:
+    """A number of each polyhedron, to be combined with `_product`."""
+    return row.reshape(-1, *[1] * vector[0].ndim)
+
+
+def distance(compound: Compound, point: Sequence[Float[Any, "*batch"]], library: Any) -> Float[Any, "*batch"]:
+    """Signed distance of points to the surface [m], negative inside; its derivatives are finite everywhere.
+
+    Args:
+      compound: whose solids together are the body.
+      point: by component, in the body's frame [m].
+      library: of the arrays.
+    """
+    values = []
+    for piece in _primitives(compound):
+        x, y, z = _local(point, piece, True)
+        level = library.stack([x, y], axis=-1)
+        values.append(PRIMITIVES[piece.shape].distance(level, z, piece.half_size, library))
+    if (rows := polyhedra(compound)) is not None:
+        values.append(library.min(_beyond(rows, point, library), axis=0))
+    return _least(values, library)
+
+
+def cut(
+    compound: Compound,
+    origin: Sequence[Float[Any, "*#rays"]],
+    direction: Sequence[Float[Any, "*#rays"]],
+    grown: float,
+    library: Any,
+) -> Float[Any, "*rays"]:
+    """Where rays from outside enter the body, as `shape.Shape.cut`; all solids are larger by `grown` [m]."""
+    values = []
+    for piece in _primitives(compound):
+        start, along = _local(origin, piece, True), _local(direction, piece, False)
+        values.append(PRIMITIVES[piece.shape].cut(start, along, _half(piece, grown), library))
+    if (rows := polyhedra(compound)) is not None:
+        values.append(library.min(_entered(rows, _offset(rows, grown), origin, direction, library), axis=0))
+    return _least(values, library)
+
+
+def _beyond(rows: Polyhedra, point: Sequence[Any], library: Any) -> Any:
+    """How far points are beyond the farthest plane of each polyhedron [m], shape (P, *batch)."""
+
+    def step(most, face):
+        normal, offset = face
+        return library.maximum(most, _product(normal, point) - _along(offset, point))
+
+    start = library.full((len(rows.offset), *point[0].shape), -library.inf, point[0].dtype)
+    return _fold(step, start, (rows.normal, rows.offset), library)
+
+
+def _entered(rows: Polyhedra, offset: np.ndarray, origin: Sequence[Any], direction: Sequence[Any], library: Any) -> Any:
+    """Where rays from outside enter each polyhedron, shape (P, *batch); infinite for misses.
+
+    Faces are compared by the inverse of the ray parameter, which is finite for rays along them: a ray is inside after
+    it has crossed all planes that its origin is beyond, and before it crosses any other.
+    """
+
+    def step(state, face):
+        normal, offset = face
+        near, far = state
+        gap = _along(offset, origin) - _product(normal, origin)
+        gap = library.where(library.abs(gap) < 1e-9, 1e-9, gap)
+        inverse = _product(normal, direction) / gap
+        before = gap < 0.0
+        near = library.where(before, library.minimum(near, inverse), near)
+        return near, library.where(before, far, library.maximum(far, inverse))
+
+    shape = np.broadcast_shapes(origin[0].shape, direction[0].shape)
+    start = tuple(library.full((len(offset), *shape), value, direction[0].dtype) for value in (library.inf, 0.0))
+    near, far = _fold(step, start, (rows.normal, offset), library)
+    hit = (near > 0.0) & (near >= far) & library.isfinite(near)
+    return library.where(hit, 1.0 / library.where(hit, near, 1.0), library.inf)
+
+
+def reach(compound: Compound, direction: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
+    """The support function, from the body's origin along unit vectors [m]."""
+    vector = [direction[..., i] for i in range(3)]
+    values = []
+    for piece in _solids(compound):
+        along = _local(vector, piece, False)
+        centre = sum(component * piece.position[i] for i, component in enumerate(vector))
+        if piece.shape == CONVEX:
+            corners = np.array(piece.vertices).T
+            out = library.max(sum(a[..., None] * library.asarray(corners[i], a.dtype) for i, a in enumerate(along)), -1)
+        else:
+            half = library.asarray(piece.half_size, direction.dtype)
+            out = PRIMITIVES[piece.shape].reach(library.stack(along, axis=-1), half, library)
+        values.append(-(centre + out))
+    return -_least(values, library)
+
+
+def inside(
+    compound: Compound, points: Float[np.ndarray, "*batch 3"], margin: float = 0.0
+) -> Bool[np.ndarray, "*batch"]:
+    """Which points in the body's frame are in the body, deeper than a margin [m]."""
+    return distance(compound, [points[..., i] for i in range(3)], np) < -margin

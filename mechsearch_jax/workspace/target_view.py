@@ -1,0 +1,127 @@
+"""The target as the planner's images and scenes hold it: as a body of superquadrics, in depth images, and as points.
+
+A box or a cylinder is one superquadric everywhere. A compound is a body of superquadric parts among the objects, but
+its own images and points are those of its exact pieces: they decide where it can still be.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import placed_parts
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make, transform
+from mechsearch_jax.shapes import solid, union
+from mechsearch_jax.shapes.parts import part_rows
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera, pixel_rays
+from mechsearch_jax.workspace.target import Target
+
+
+def body_at(
+    target: Target,
+    position: Float[Array, "*batch 3"],
+    rotation: Float[Array, "*batch 3 3"],
+    valid: Bool[Array, "*batch"],
+) -> Superquadrics:
+    """The target at poses in the world, with the given leading axes; with `parts` if it is a compound.
+
+    A compound's own superquadric is a box about its centre of mass that contains it.
+    """
+    parts = None
+
+    def constant(row: np.ndarray) -> Array:
+        return jnp.asarray(np.broadcast_to(row, (*valid.shape, *row.shape)))
+
+    if target.compound is not None:
+        parts = Superquadrics(*(constant(row) for row in part_rows(target.compound)))
+    return Superquadrics(
+        size=constant(np.float32(target.half_size)),
+        exponents=constant(np.float32(target.exponents)),
+        position=position,
+        rotation=rotation,
+        valid=valid,
+        parts=parts,
+    )
+
+
+def main_body(
+    target: Target,
+    position: Float[Array, "*batch 3"],
+    rotation: Float[Array, "*batch 3 3"],
+    valid: Bool[Array, "*batch"],
+) -> Superquadrics:
+    """One superquadric that is in the target, where bodies of parts do not count: a compound's largest part.
+
+    Args:
+      target, position, rotation, valid: as of `body_at`.
+    """
+    body = body_at(target, position, rotation, valid)
+    if target.compound is None:
+        return body
+    largest = int(np.argmax(part_rows(target.compound)[0].prod(axis=1)))
+    axis = len(valid.shape)
+    return jax.tree.map(lambda a: jnp.take(a, largest, axis=axis), placed_parts(body))
+
+
+def window_image(
+    camera: Camera, target: Target, T_world_target: Float[Array, "4 4"], window: tuple[int, int]
+) -> render.Window:
+    """Depth of a target at a pose in a window of fixed size around its image, see `render.object_window`.
+
+    Args:
+      camera: the camera at the window's resolution.
+      target: static.
+      T_world_target: its pose.
+      window: rows and columns; static.
+    """
+    box = box_around(target, T_world_target)
+    if target.compound is None:
+        return render.object_window(camera, box, window)
+    corner, stride = render.window_place(camera, box, window)
+    rows, columns = jnp.meshgrid(jnp.arange(window[0]), jnp.arange(window[1]), indexing="ij")
+    middle = (stride - 1) / 2.0
+    along = pixel_rays(camera, rows * stride + corner[0] + middle, columns * stride + corner[1] + middle)
+    R, offset = T_world_target[:3, :3], jnp.array(camera.position) - T_world_target[:3, 3]
+    origin = [sum(offset[j] * R[j, i] for j in range(3)).reshape(1, 1) for i in range(3)]
+    local = [sum(along[..., j] * R[j, i] for j in range(3)) for i in range(3)]
+    return render.Window(union.cut(target.compound, origin, local, 0.0, jnp), corner, stride)
+
+
+def extent(target: Target) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """The middle of the smallest box around the target along its axes, and its half-extents [m], float32."""
+    against, along = target.solid.extent(np.eye(3), np)
+    return np.float32((along - against) / 2), np.float32((along + against) / 2)
+
+
+def framed(target: Target, T_world_target: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
+    """Poses of the box of `extent` from the target's; for a box or a cylinder they are the same."""
+    if target.compound is None:
+        return T_world_target
+    middle = transform(T_world_target[..., None, :, :], jnp.asarray(extent(target)[0])[None])[..., 0, :]
+    return make(T_world_target[..., :3, :3], middle)
+
+
+def box_around(target: Target, T_world_target: Float[Array, "4 4"]) -> Superquadrics:
+    """The box of `extent` at a pose of the target, or the target itself if it is one superquadric."""
+    T_world_box = framed(target, T_world_target)
+    return Superquadrics(
+        size=jnp.float32(target.half_size if target.compound is None else extent(target)[1]),
+        exponents=jnp.float32(target.exponents),
+        position=T_world_box[:3, 3],
+        rotation=T_world_target[:3, :3],
+        valid=jnp.array(True),
+    )
+
+
+def surface_cloud(target: Target, count: int, erosion: float) -> Float[np.ndarray, "n 3"]:
+    """At most `count` points on the surface of the target shrunk by `erosion`, in its own frame [m]."""
+    if target.compound is None:
+        sample = jax.jit(superquadric.sample_surface, static_argnames="count")
+        half = np.array(target.half_size, np.float32) - np.float32(erosion)
+        return np.asarray(sample(half, np.array(target.exponents, np.float32), count=count))
+    return np.float32(solid.surface(target.compound, count, erosion))

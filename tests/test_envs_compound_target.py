@@ -1,0 +1,248 @@
+"""A target that is a compound in the world: its files, arrays and image, how it rests, in trials and in the batch."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from test_envs_simulator import pose, take_out
+
+from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe, target_pixels
+from mechsearch_jax.envs.camera.snapshot import Snapshot, sight_of
+from mechsearch_jax.envs.episode.episodes import target_of
+from mechsearch_jax.envs.recording.body_solids import body_points, body_solids
+from mechsearch_jax.envs.simulators.batch_model import cells_of
+from mechsearch_jax.envs.simulators.compound_batch import ROOM, compound_fields, fitting, like_present, room_for
+from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
+from mechsearch_jax.envs.trials import native as trials
+from mechsearch_jax.envs.world import model
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
+from mechsearch_jax.envs.world.world import (
+    BODIES,
+    TARGET,
+    CompoundWorld,
+    TargetCompoundWorld,
+    World,
+    bodies_of,
+    from_scenario,
+    slots,
+    with_target,
+)
+from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes.compound import CONVEX, Piece
+from mechsearch_jax.workspace import scenario as scenarios
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_file import load_target
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+SHELF = Shelf()
+BOX = Body("box", (0.02, 0.08, 0.06), (0.5, 0.15, SHELF.board + 0.06), UPRIGHT)
+MUG = Target.from_parts(
+    (
+        Piece("cylinder", (0.03, 0.03, 0.045)),
+        Piece("box", (0.004, 0.005, 0.03), (0.05, 0.0, 0.0)),
+        Piece("box", (0.012, 0.005, 0.004), (0.038, 0.0, 0.026)),
+        Piece("box", (0.012, 0.005, 0.004), (0.038, 0.0, -0.026)),
+    ),
+    density=500.0,
+    friction=0.5,
+    colour=(0.1, 0.2, 0.9),
+)
+WEDGE = ((-0.025, -0.02, -0.04), (0.025, -0.02, -0.04), (-0.025, 0.02, -0.04), (0.025, 0.02, -0.04), (0.0, 0.0, 0.06))
+TENT = Target.from_parts((Piece(CONVEX, (0.0, 0.0, 0.0), vertices=WEDGE),))
+TALL = Target.from_parts((Piece("box", (0.03, 0.03, 0.15)), Piece("box", (0.01, 0.06, 0.01))))
+
+
+def standing(target, x=0.65, y=0.1, yaw=0.0):
+    """The body of a target on the board."""
+    turn = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+    return Body(target.shape, target.half_size, (x, y, SHELF.board + target.bottom), turn, target.compound)
+
+
+def hidden(target, *objects, **place):
+    return Scenario("hidden", objects, standing(target, **place))
+
+
+@pytest.mark.parametrize("target", [MUG, TENT], ids=["mug", "polyhedron"])
+def test_a_scenario_with_a_compound_target_is_written_and_read(tmp_path, target):
+    scene = hidden(target, BOX, yaw=0.5)
+    scenarios.save_scenario(scene, tmp_path / "scene.json")
+    again = scenarios.load_scenario(tmp_path / "scene.json")
+    assert again == scene
+    assert again.content_hash == scene.content_hash
+    assert json.loads((tmp_path / "scene.json").read_text())["version"] == 2
+    assert target_of(again, Target()) == target
+    assert hash(target_of(again, Target())) == hash(target)
+
+
+def test_only_a_world_whose_target_is_a_compound_is_one_of_those():
+    cylinder = Body("cylinder", (0.02, 0.02, 0.05), (0.7, 0.0, 0.4545), UPRIGHT)
+    assert type(from_scenario(Scenario("plain", (BOX,), cylinder))) is World
+    assert type(from_scenario(Scenario("things", (standing(MUG),), cylinder))) is CompoundWorld
+    world = from_scenario(hidden(MUG, BOX))
+    assert type(world) is TargetCompoundWorld
+    assert bodies_of(world)[TARGET].compound == MUG.compound
+    assert bodies_of(world)[0].shape == "box"
+
+
+def test_a_plain_world_gets_the_targets_pieces():
+    scene = hidden(MUG, BOX, yaw=0.5)
+    world = from_scenario(scene)
+    plain = World(*(getattr(world, field.name) for field in dataclasses.fields(World)))
+    again = with_target(plain, MUG)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(world), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+    assert with_target(plain, Target.box()) is plain
+
+
+def test_the_camera_sees_the_target_in_its_own_colour():
+    image = observe(Camera().scaled(4), from_scenario(hidden(MUG)))
+    there = np.asarray(image.segmentation) == TARGET
+    assert there.sum() > 100
+    shades = np.asarray(image.colour)[there] / PALETTE[TARGET]
+    np.testing.assert_allclose(shades, np.repeat(shades[:, :1], 3, axis=1), atol=1e-5)
+
+
+@pytest.mark.parametrize("place", [{"x": 0.46, "y": 0.35}, {"x": 0.72, "y": -0.2}], ids=["near", "far"])
+def test_all_of_a_tall_target_is_counted(place):
+    world = from_scenario(hidden(TALL, **place))
+    whole = int((np.asarray(observe(Camera(), world).segmentation) == TARGET).sum())
+    assert int(target_pixels(Camera(), world)) == whole
+    sight = sight_of(Camera(), SHELF, TALL)
+    assert int(target_pixels(Camera(), world, sight.window)) == whole
+    assert bool(Snapshot(Camera(), SHELF, world).target_seen)
+    assert sight_of(Camera(), SHELF, Target.box()).window == sight_of(Camera(), SHELF).window
+
+
+@pytest.mark.parametrize("target", [MUG, TENT, TALL], ids=["mug", "polyhedron", "tall"])
+def test_it_stands_where_it_is_put(target):
+    simulator = NativeWorld()
+    before = simulator.reset(hidden(target, BOX, yaw=0.5))
+    outcome = simulator.settle()
+    assert bool(outcome.settled)
+    assert not np.asarray(outcome.fallen).any()
+    np.testing.assert_allclose(simulator.world.position, before.position, atol=1e-3)
+    assert simulator.world.rotation[TARGET][2, 2] > 0.999
+    assert simulator.scenario("after").target.compound == target.compound
+
+
+def test_the_hand_takes_it_out():
+    simulator = NativeWorld()
+    simulator.reset(hidden(MUG, x=0.6, y=0.1, yaw=math.pi))
+    outcome = simulator.execute(take_out(pose(0.6, 0.1, 0.05)))
+    assert bool(outcome.retrieved), outcome.reason()
+
+
+def test_a_found_target_stands_in_trials_as_what_it_is():
+    cell, simulation = trials.Cell(MUG, SHELF, Gripper()), SimulatorConfig()
+    at, nothing = jnp.array([0.6, 0.1, 0.5]), jax.device_get(empty(TARGET))
+    for found in (True, False):
+        world = jax.device_get(trials._world(MUG, SHELF, nothing, at, jnp.array(found)))
+        scene = trials._at_rest(cell, simulation, world, nothing, 1.0, 1.0)
+        assert scene is not None
+        assert not scene.diverged
+        body = scene._bodies[TARGET]
+        assert (body is not None) == found
+        if found:
+            assert body.compound == MUG.compound
+            rests = scene._data.joint(f"body{TARGET}").qpos[:3]
+            np.testing.assert_allclose(rests, (0.6, 0.1, SHELF.board + MUG.bottom), atol=1e-3)
+
+
+def test_the_batch_model_holds_the_target_itself():
+    scenes = [hidden(TENT, BOX, yaw=0.5), hidden(TENT, standing(MUG, 0.5, -0.1), x=0.7)]
+    factors = np.linspace(0.5, 1.5, BODIES)
+    cells = [ASSUMED_CELL, ActualCell(friction=0.5, mass=2.0, body_friction=factors, body_mass=factors[::-1])]
+    worlds = [from_scenario(scene) for scene in scenes]
+    world = jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *worlds)
+    assert room_for(world) == {**ROOM, TARGET: TENT.compound}
+    blank = model.compile_model(SHELF, Camera(), compounds=room_for(world))
+    assert fitting(world, room_for(world)) is world
+    fields = compound_fields(blank, world, cells_of(blank, cells))
+    for w, (scene, cell) in enumerate(zip(scenes, cells, strict=True)):
+        own = NativeWorld()
+        own.place(slots(scene), cell)
+        for name in ("body_mass", "body_inertia", "body_invweight0", "body_iquat", "body_gravcomp"):
+            body = blank.body(f"body{TARGET}").id
+            found, wanted = np.asarray(getattr(fields, name))[w, body], getattr(own._model, name)[body]
+            np.testing.assert_allclose(found, wanted, 1e-5, 1e-7, err_msg=name)
+        geoms = [np.flatnonzero(m.geom_bodyid == m.body(f"body{TARGET}").id) for m in (blank, own._model)]
+        assert len(geoms[0]) == len(geoms[1]) == 1
+        for name in ("friction", "size", "rbound", "pos", "quat"):
+            found, wanted = np.asarray(getattr(fields, f"geom_{name}"))[w, geoms[0]], own._model
+            np.testing.assert_allclose(found, getattr(wanted, f"geom_{name}")[geoms[1]], 1e-5, 1e-6, err_msg=name)
+
+
+def test_worlds_of_another_target_do_not_stand_side_by_side():
+    present = jax.tree.map(lambda leaf: np.asarray(leaf)[None], from_scenario(hidden(MUG, BOX)))
+    with pytest.raises(InputError, match="another target; run them one set after the other"):
+        like_present(present, hidden(TALL, BOX))
+    with pytest.raises(InputError, match="differ in their target"):
+        fitting(present, room_for(from_scenario(hidden(TALL))))
+
+
+def test_pictures_show_its_solids():
+    world = jax.tree.map(np.asarray, from_scenario(hidden(TENT, BOX)))
+    shown = body_solids(world)
+    assert sorted(shown) == sorted(body_points(world)) == [0, TARGET]
+    (tent,) = shown[TARGET]
+    assert tent.colour == tuple(map(float, PALETTE[TARGET]))
+    rays = [np.linspace(-0.02, 0.02, 5), np.zeros(5), -np.ones(5)]
+    depth = tent.surface.cut([0.0, 0.0, 1.0], rays, tent.half_size, np)
+    hull = trimesh.convex.convex_hull(np.array(TENT.compound.pieces[0].vertices))
+    points = np.stack([rays[0] * depth, rays[1] * depth, 1.0 - depth], axis=1)
+    outside = points @ hull.face_normals.T - np.einsum("fi,fi->f", hull.face_normals, hull.triangles_center)
+    np.testing.assert_allclose(outside.max(axis=1), 0.0, atol=1e-6)
+    normal = tent.surface.normal(points, np.broadcast_to(tent.half_size, (5, 3)), np)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-6)
+
+
+BODY = {
+    "density": 500,
+    "friction": 0.4,
+    "pieces": [{"shape": "box", "half_size": [0.03, 0.02, 0.05], "position": [0, 0, 0], "quaternion": list(UPRIGHT)}],
+}
+ON_ITS_SIDE = [0.5**0.5, 0.5**0.5, 0.0, 0.0]
+
+
+def test_a_target_is_read_from_a_mesh_or_a_body(tmp_path):
+    box = trimesh.creation.box((60, 40, 100))
+    box.export(tmp_path / "box.stl")
+    mesh = load_target(tmp_path / "box.stl", 0.001)
+    np.testing.assert_allclose(mesh.half_size, (0.03, 0.02, 0.05), atol=1e-6)
+    (tmp_path / "body.json").write_text(json.dumps(BODY))
+    body = load_target(tmp_path / "body.json")
+    np.testing.assert_allclose(body.half_size, (0.03, 0.02, 0.05), atol=1e-6)
+    for made in (BODY, {"mesh": "box.stl", "scale": 0.001, "density": 500, "friction": 0.4}):
+        (tmp_path / "turned.json").write_text(json.dumps({**made, "quaternion": ON_ITS_SIDE}))
+        turned = load_target(tmp_path / "turned.json")
+        np.testing.assert_allclose(turned.half_size, (0.03, 0.05, 0.02), atol=1e-6)
+        assert turned.bottom == pytest.approx(0.02, abs=1e-6)
+        assert turned.compound.density == 500.0
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({"shape": "box"}, "must be a JSON object with pieces or mesh, density and friction"),
+        ({**BODY, "position": [0, 0, 0]}, 'unknown key "position"'),
+        ({**BODY, "quaternion": [1, 1, 0, 0]}, "quaternion: its norm is"),
+        ({**BODY, "pieces": []}, "pieces: must be a list of at least one piece"),
+    ],
+)
+def test_what_is_wrong_with_a_target_file_is_named(tmp_path, value, message):
+    (tmp_path / "body.json").write_text(json.dumps(value))
+    with pytest.raises(InputError) as caught:
+        load_target(tmp_path / "body.json")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
