@@ -125,6 +125,13 @@ def test_what_it_sweeps_is_around_it(target):
     assert np.abs(away.min(axis=1)).max() < 0.002 + 0.3 / 200
 
 
+def test_a_box_of_one_piece_is_grasped_square_to_its_sides_as_a_box_is():
+    target = Target.from_parts((Piece("box", Target.box().half_size),))
+    poses = [np.asarray(grasp_tables(Gripper(), each, GraspConfig()).T_target_gripper) for each in (target, Target.box())]
+    own, usual = ({int(round(math.degrees(math.atan2(T[1, 2], T[0, 2])))) % 360 for T in each} for each in poses)
+    assert own == usual == {0, 90, 180, 270}
+
+
 def test_a_target_that_the_gripper_cannot_take_is_refused_in_one_line():
     ball = Target.from_parts((Piece("ellipsoid", (0.06, 0.06, 0.06)),))
     with pytest.raises(InputError, match="Target: the gripper fits nowhere"):

@@ -246,3 +246,12 @@ def test_what_is_wrong_with_a_target_file_is_named(tmp_path, value, message):
         load_target(tmp_path / "body.json")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_compound_that_is_upside_down_has_fallen_over_and_a_cylinder_stands_on_either_end():
+    flipped = np.diag([1.0, -1.0, -1.0])
+    assert fallen_over(flipped, MUG.solid.ends_alike)
+    assert not fallen_over(flipped, Target.cylinder().solid.ends_alike)
+    for target in (MUG, Target.cylinder()):
+        assert not fallen_over(np.eye(3), target.solid.ends_alike)
+        assert fallen_over(np.eye(3)[[1, 2, 0]], target.solid.ends_alike)

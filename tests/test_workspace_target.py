@@ -72,11 +72,34 @@ def test_a_mesh_is_a_target(tmp_path):
 
 
 def test_what_is_no_target_is_refused_in_one_line(tmp_path):
-    with pytest.raises(InputError, match="needs at least one"):
+    with pytest.raises(InputError, match="at least one"):
         Target.from_parts(())
-    with pytest.raises(InputError, match=r"Target: mesh: .*nothing.stl cannot be read"):
+    with pytest.raises(InputError, match=r"nothing.stl: target.mesh: .*nothing.stl cannot be read"):
         Target.from_mesh(tmp_path / "nothing.stl")
-    with pytest.raises(InputError, match="at most"):
-        Target.from_parts((Piece("box", (1.5, 0.1, 0.1)),))
+    trimesh.creation.box(extents=(40, 40, 100)).export(tmp_path / "in-mm.stl")
+    with pytest.raises(InputError, match=r"in-mm.stl: target.mesh: .* give its unit as scale, such as 0.001"):
+        Target.from_mesh(tmp_path / "in-mm.stl")
+    for scale in (0.0, -1.0, 1e-9, float("nan"), float("inf")):
+        with pytest.raises(InputError, match=r"in-mm.stl: target.scale: .* must be a number from"):
+            Target.from_mesh(tmp_path / "in-mm.stl", scale)
+    box = Piece("box", (0.02, 0.02, 0.05))
+    for pieces, message in (
+        ((Piece("sphere", (0.1, 0.1, 0.1)),), r"pieces\[0\].shape: \"sphere\" is unknown"),
+        ((Piece("box", (1.5, 0.1, 0.1)),), r"pieces\[0\].half_size: .* must be lengths"),
+        ((Piece("box", (-0.02, 0.1, 0.1)),), r"pieces\[0\].half_size: .* must be lengths"),
+        ((box, Piece("box", (0.02, 0.02, 0.05), quaternion=(2.0, 0.0, 0.0, 0.0))), r"pieces\[1\].quaternion: its norm"),
+        ((box,) * 20, "20 solids are too many"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Target.from_parts(pieces)
+    with pytest.raises(InputError, match=r"Target\.density"):
+        Target.from_parts((box,), density=-1.0)
+    with pytest.raises(InputError, match=r"Target\.friction"):
+        Target.from_parts((box,), friction=float("nan"))
+    with pytest.raises(InputError, match="tips it, but it stands upright"):
+        Target.of_body(Body(COMPOUND, (0.1,) * 3, (0.6, 0.1, 0.5), (0.0, 1.0, 0.0, 0.0), Target.from_parts((box,)).compound))
+    tall = Target.from_parts((Piece("box", (0.02, 0.02, 0.19)),))
+    with pytest.raises(InputError, match=r"0\.380 m tall, but the shelf is 0\.\d+ m high"):
+        tall.check_fits(Shelf())
     with pytest.raises(InputError, match=r"Target\.from_parts"):
         Target(COMPOUND)

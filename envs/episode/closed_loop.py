@@ -219,7 +219,8 @@ class EpisodePool:
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:
         """In which of these slots the target can no longer be taken out, and why."""
         position, rotation = (a[:, TARGET] for a in jax.device_get((world.position, world.rotation)))
-        reasons = {r: target_trouble(self._problem.shelf, position[r], rotation[r]) for r in rows}
+        shelf, alike = self._problem.shelf, self._problem.target.solid.ends_alike
+        reasons = {r: target_trouble(shelf, position[r], rotation[r], alike) for r in rows}
         return {r: reason for r, reason in reasons.items() if reason}
 
     def _act(self, choices: Mapping[int, Choice], trouble: Mapping[int, str]) -> list[tuple[int, tuple[int, Episode]]]:

@@ -77,11 +77,13 @@ def distrust(choice: Choice) -> str | None:
     return None if all(np.all(np.isfinite(n)) for n in numbers) else "error: the decision is not finite"
 
 
-def target_trouble(shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]) -> str | None:
-    """Why a target at this pose can no longer be retrieved; None if it can."""
+def target_trouble(
+    shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True
+) -> str | None:
+    """Why a target at this pose can no longer be retrieved; None if it can. See `world.fallen_over`."""
     if position[0] < shelf.front or position[2] < shelf.board:
         return "the target fell off the board"
-    return "the target fell over" if fallen_over(rotation) else None
+    return "the target fell over" if fallen_over(rotation, ends_alike) else None
 
 
 def overflow_trouble(outcome: Outcome, i: int) -> str | None:

@@ -163,11 +163,12 @@ class ScenarioGenerator:
         draw: draws the objects; the paper's if None.
 
         Raises:
-          InputError: objects would be dropped beside the board.
+          InputError: objects would be dropped beside the board, or the target is taller than the shelf.
         """
         self.target = target or Target()
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
+        self.target.check_fits(self._shelf)
         self._camera = camera or Camera()
         self._draw = draw or draws_from(ObjectSizes())
         for name, low, high in (("x", self._shelf.front, self._shelf.back), ("y", self._shelf.right, self._shelf.left)):

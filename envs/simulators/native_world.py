@@ -204,8 +204,8 @@ class NativeWorld:
 
     def _target_lies(self) -> bool:
         """Whether there is a target that has fallen over."""
-        quaternion = self._data.joint(f"body{TARGET}").qpos[3:]
-        return self._bodies[TARGET] is not None and fallen_over(rotation_matrix(quaternion))
+        quaternion, body = self._data.joint(f"body{TARGET}").qpos[3:], self._bodies[TARGET]
+        return body is not None and fallen_over(rotation_matrix(quaternion), body.compound is None)
 
     def _perform(self, kind: Kind, reference: Reference, index: int) -> tuple[Failure, float, bool]:
         """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""

@@ -28,9 +28,10 @@ BODIES = MAX_OBJECTS + 1
 MAX_TILT = math.radians(15)
 
 
-def fallen_over(rotation: Float[np.ndarray, "3 3"]) -> bool:
-    """Whether a target with this `R_world_target` has fallen over."""
-    return bool(abs(rotation[2, 2]) < math.cos(MAX_TILT))
+def fallen_over(rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True) -> bool:
+    """Whether a target with this `R_world_target` has fallen over; one with `Solid.ends_alike` stands on either end."""
+    upright = abs(rotation[2, 2]) if ends_alike else rotation[2, 2]
+    return bool(upright < math.cos(MAX_TILT))
 
 
 class World(flax.struct.PyTreeNode):

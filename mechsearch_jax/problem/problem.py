@@ -77,14 +77,16 @@ def build_problem(
     """Precompute everything that does not depend on the objects. Takes seconds; not to be called inside `jit`.
 
     Raises:
-      InputError: the camera does not see the shelf, the gripper cannot grasp the target, or reaches it nowhere, a kind
-        of action cannot be sampled, the gripper's poses outside the shelf are inside, or `config` is of another class.
+      InputError: the camera does not see the shelf, the target is taller than it, the gripper cannot grasp the target,
+        or reaches it nowhere, a kind of action cannot be sampled, the gripper's poses outside the shelf are inside, or
+        `config` is of another class.
     """
     target, camera, shelf = target or Target(), camera or Camera(), shelf or Shelf()
     gripper, config = gripper or Gripper(), ProblemConfig() if config is None else config
     if not isinstance(config, ProblemConfig):
         raise InputError(f"config: is a {type(config).__name__}; give a ProblemConfig, such as paper().problem")
     check_camera(camera, shelf)
+    target.check_fits(shelf)
     check_outside(gripper, shelf)
     check_kinds(config.actions.actions)
     # This compiles a hundred small programs, which takes longer for a GPU.

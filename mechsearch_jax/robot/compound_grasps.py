@@ -29,7 +29,7 @@ HEIGHTS, FROM_ENDS, DEPTH, ALONG = 7, 0.012, 0.008, 0.001
 PAD, PAD_FRONT, PAD_BACK, PAD_LINES = 0.0095, 0.006, 0.012, 5
 # Surface this far from where a pad comes to rest touches it [m]; the least share of the pads' lines that do; and the
 # largest angles between the closing direction and the surface's normal there, and the line of the forces [rad].
-TOUCH, LEAST_CONTACT, FACING, ALIGNED = 0.0015, 0.12, math.radians(24), math.radians(20)
+TOUCH, LEAST_CONTACT, FACING, ALIGNED = 0.0015, 0.2, math.radians(14), math.radians(14)
 # Share of the lines that touch beyond which more gain nothing.
 ENOUGH = 0.5
 # Points of the body's surface that the open gripper must not meet, and how deep they may be in it [m].

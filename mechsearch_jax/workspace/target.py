@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,8 +16,9 @@ from jaxtyping import Array, Float
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
-from mechsearch_jax.shapes.meshes import QUICKLY, convex_pieces
+from mechsearch_jax.shapes.meshes import QUICKLY
 from mechsearch_jax.shapes.solid import Solid, Union, Whole
+from mechsearch_jax.workspace.compound_file import format_compound, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
 
 if TYPE_CHECKING:
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 # Largest half-extent and inset [m], and largest number of candidate poses.
 LARGEST = 1.0
 MOST_POSES = 100_000
+# Cosine of the largest angle by which a scenario may tip a target of pieces.
+UPRIGHT = math.cos(math.radians(5))
 # What a target of pieces or of a mesh is made of, if nothing is said: density [kg/m3] and friction.
 DENSITY, FRICTION = 600.0, 0.5
 
@@ -90,7 +95,6 @@ class Target:
         pieces: Sequence[Piece],
         density: float = DENSITY,
         friction: float = FRICTION,
-        colour: tuple[float, float, float] | None = None,
     ) -> Target:
         """A target of several convex pieces, which stands upright in their frame, z up.
 
@@ -98,14 +102,13 @@ class Target:
           pieces: at least one; they may overlap.
           density: [kg/m3].
           friction: coefficient of sliding friction against anything that is not rougher.
-          colour: red, green and blue, 0 to 1; None for the target's usual colour.
 
         Raises:
-          InputError: there are no pieces, or the target is too large.
+          InputError: there are no pieces or too many, one is no solid of a sensible size, a number is out of range, or
+            the target is too large.
         """
-        if not pieces:
-            raise InputError("Target: a target of pieces needs at least one")
-        return cls.of_compound(Compound(tuple(pieces), density, friction, colour))
+        given = json.loads(json.dumps(format_compound(Compound(tuple(pieces), density, friction))))
+        return cls.of_compound(parse_compound(given, (), "Target", Path()))
 
     @classmethod
     def from_mesh(
@@ -114,28 +117,36 @@ class Target:
         scale: float = 1.0,
         density: float = DENSITY,
         friction: float = FRICTION,
-        colour: tuple[float, float, float] | None = None,
     ) -> Target:
         """A target of the shape of a mesh file (OBJ, STL or PLY), which stands upright in its frame, z up.
 
         Args:
           path: of the file; see `shapes.meshes.convex_pieces`.
           scale: metres per unit of the file.
-          density, friction, colour: as of `from_parts`.
+          density, friction: as of `from_parts`.
 
         Raises:
-          InputError: the file cannot be read, is no solid mesh, or is too large.
+          InputError: the file cannot be read, is no solid mesh, or a number is out of range, or the target is too small
+            or too large, as where `scale` is that of another unit.
         """
-        return cls.from_parts(convex_pieces(Path(path), scale, "Target: mesh", QUICKLY), density, friction, colour)
+        given = {"mesh": os.fspath(path), "scale": scale, "density": density, "friction": friction}
+        return cls.of_compound(parse_compound(given, (), f"{path}: target", Path(), QUICKLY))
 
     @classmethod
     def of_body(cls, body: Body) -> Target:
         """The target that a scenario's body is, with the usual candidate poses.
 
         Raises:
-          InputError: as `of`.
+          InputError: as `of`, or a compound is tipped by its quaternion.
         """
-        return cls.of(body.shape, body.half_size) if body.compound is None else cls.of_compound(body.compound)
+        if body.compound is None:
+            return cls.of(body.shape, body.half_size)
+        _, x, y, _ = body.quaternion
+        if 1 - 2 * (x * x + y * y) < UPRIGHT:
+            raise InputError(
+                f"Target: its quaternion {body.quaternion} tips it, but it stands upright; turn its pieces instead, z up"
+            )
+        return cls.of_compound(body.compound)
 
     @classmethod
     def of_compound(cls, compound: Compound) -> Target:
@@ -144,7 +155,8 @@ class Target:
         Raises:
           InputError: it is too large.
         """
-        compound, _ = centred(compound)
+        # Its colour is the detector's, whatever the compound's own.
+        compound = dataclasses.replace(centred(compound)[0], colour=None)
         return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
 
     def like(self, other: Target) -> Target:
@@ -206,6 +218,16 @@ class Target:
     def height(self, shelf: Shelf) -> float | Array:
         """z of the centre of a target that stands on the board [m]; the shelf may be traced."""
         return shelf.board + self.bottom
+
+    def check_fits(self, shelf: Shelf) -> None:
+        """Check that it is lower than the shelf.
+
+        Raises:
+          InputError: it is not.
+        """
+        room = float(shelf.ceiling - shelf.board)
+        if self.tall > room:
+            raise InputError(f"Target: {self.tall:.3f} m tall, but the shelf is {room:.3f} m high inside; use a lower one")
 
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
         """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.

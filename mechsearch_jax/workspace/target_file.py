@@ -50,7 +50,7 @@ def load_target(path: PathLike, scale: float = 1.0) -> Target:
     body = {key: entry for key, entry in value.items() if key != TURN}
     compound = parse_compound(body, (), str(file), file.parent, QUICKLY)
     pieces = [_turned(piece, turn) for piece in compound.pieces]
-    return Target.from_parts(pieces, compound.density, compound.friction, compound.colour)
+    return Target.from_parts(pieces, compound.density, compound.friction)
 
 
 def _turned(piece: Piece, turn: Rotation) -> Piece:
