@@ -219,9 +219,11 @@ def _pictured(world: World) -> Appearance:
     """The appearance in pictures: objects that are compounds have their own colours, if they have any."""
     colours: jax.Array | np.ndarray = PALETTE
     if isinstance(world, CompoundWorld):
-        given = world.compounds.matter.colour[:TARGET]
-        objects = jnp.where(jnp.isnan(given), PALETTE[:TARGET], given)
-        colours = jnp.concatenate([objects, PALETTE[TARGET:]])
+        given = world.compounds.matter.colour
+        if isinstance(world, TargetCompoundWorld):
+            given = given.at[TARGET].set(jnp.nan)
+        bodies = jnp.where(jnp.isnan(given), PALETTE[:BODIES], given)
+        colours = jnp.concatenate([bodies, PALETTE[BODIES:]])
     return Appearance(colours, np.array(LIGHT))
 
 
