@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.kind import Kind
@@ -281,9 +282,9 @@ class _Assembly:
     def _target_scene(self, pose: np.ndarray) -> Superquadrics:
         """The target at a pose, as a scene of one object."""
         T = pose[None]
-        scene = body_at(self.problem.target, T[:, :3, 3], T[:, :3, :3], np.array([True]))  # pyright: ignore[reportArgumentType]
+        scene = body_at(self.problem.target, T[:, :3, 3], T[:, :3, :3], np.array([True]))
         # Boxes around the parts are nearer to it than the one around the whole.
-        return world_parts(scene)
+        return scene if scene.parts is None else world_parts(jax.tree.map(jnp.asarray, scene))
 
     def _held(self) -> Held:
         """What the closed hand holds; a target that is not visible is assumed between the fingers."""

@@ -88,40 +88,32 @@ def _least(values: list[Any], library: Any) -> Any:
     return least
 
 
-def _fold(step: Callable[[Any, Any], Any], start: Any, rows: tuple[np.ndarray, ...], library: Any) -> Any:
-    """A step over the faces of all polyhedra, one face of each at a time.
+def _fold(step: Callable[[Any, Any], Any], start: Any, rows: tuple[Any, ...], library: Any) -> Any:
+    """A step over rows, one after the other, such as over the faces of a polyhedron.
 
-    The points or rays are the innermost axis of everything in it: on a CPU thirty times as fast as a reduction over the
-    faces of each of them.
+    Everything in a step has the axes of the points or rays: on a CPU that is thirty times as fast as a reduction over
+    the faces for each of them.
 
     Args:
-      step: of a state and the rows of a face.
+      step: of a state and a row of each array.
       start: the first state.
-      rows: arrays (P, F, ...).
+      rows: arrays (n, ...).
       library: of the arrays.
     """
-    by_face = tuple(np.swapaxes(row, 0, 1) for row in rows)
     if library is np:
         state = start
-        for face in zip(*by_face, strict=True):
-            state = step(state, face)
+        for row in zip(*rows, strict=True):
+            state = step(state, row)
         return state
     # Only for arrays of JAX, which is loaded then.
     import jax
 
-    cast = tuple(library.asarray(row, library.float32) for row in by_face)
-    return jax.lax.scan(lambda state, face: (step(state, face), None), start, cast)[0]
+    cast = tuple(library.asarray(row, library.float32) for row in rows)
+    return jax.lax.scan(lambda state, row: (step(state, row), None), start, cast)[0]
 
 
-def _product(normal: Float[Any, "p 3"], vector: Sequence[Any]) -> Any:
-    """Products of the normals with vectors, shape (P, *batch)."""
-    lead = (-1, *[1] * vector[0].ndim)
-    return sum(component[None] * normal[:, i].reshape(lead) for i, component in enumerate(vector))
-
-
-def _along(row: Float[Any, " p"], vector: Sequence[Any]) -> Any:
-    """A number of each polyhedron, to be combined with `_product`."""
-    return row.reshape(-1, *[1] * vector[0].ndim)
+def _product(normal: Float[Any, " 3"], vector: Sequence[Any]) -> Any:
+    return vector[0] * normal[0] + vector[1] * normal[1] + vector[2] * normal[2]
 
 
 def distance(compound: Compound, point: Sequence[Float[Any, "*batch"]], library: Any) -> Float[Any, "*batch"]:
@@ -138,7 +130,7 @@ def distance(compound: Compound, point: Sequence[Float[Any, "*batch"]], library:
         level = library.stack([x, y], axis=-1)
         values.append(PRIMITIVES[piece.shape].distance(level, z, piece.half_size, library))
     if (rows := polyhedra(compound)) is not None:
-        values.append(library.min(_beyond(rows, point, library), axis=0))
+        values.append(_beyond(rows, point, library))
     return _least(values, library)
 
 
@@ -155,43 +147,51 @@ def cut(
         start, along = _local(origin, piece, True), _local(direction, piece, False)
         values.append(PRIMITIVES[piece.shape].cut(start, along, _half(piece, grown), library))
     if (rows := polyhedra(compound)) is not None:
-        values.append(library.min(_entered(rows, _offset(rows, grown), origin, direction, library), axis=0))
+        values.append(_entered(rows, _offset(rows, grown), origin, direction, library))
     return _least(values, library)
 
 
 def _beyond(rows: Polyhedra, point: Sequence[Any], library: Any) -> Any:
-    """How far points are beyond the farthest plane of each polyhedron [m], shape (P, *batch)."""
+    """How far points are beyond the farthest plane of a polyhedron [m], at least of all polyhedra."""
 
-    def step(most, face):
+    def of_face(most, face):
         normal, offset = face
-        return library.maximum(most, _product(normal, point) - _along(offset, point))
+        return library.maximum(most, _product(normal, point) - offset)
 
-    start = library.full((len(rows.offset), *point[0].shape), -library.inf, point[0].dtype)
-    return _fold(step, start, (rows.normal, rows.offset), library)
+    def of_polyhedron(least, faces):
+        most = library.full(point[0].shape, -library.inf, point[0].dtype)
+        return library.minimum(least, _fold(of_face, most, faces, library))
+
+    start = library.full(point[0].shape, library.inf, point[0].dtype)
+    return _fold(of_polyhedron, start, (rows.normal, rows.offset), library)
 
 
 def _entered(rows: Polyhedra, offset: np.ndarray, origin: Sequence[Any], direction: Sequence[Any], library: Any) -> Any:
-    """Where rays from outside enter each polyhedron, shape (P, *batch); infinite for misses.
+    """Where rays from outside enter the first polyhedron; infinite for misses.
 
     Faces are compared by the inverse of the ray parameter, which is finite for rays along them: a ray is inside after
     it has crossed all planes that its origin is beyond, and before it crosses any other.
     """
+    shape = np.broadcast_shapes(origin[0].shape, direction[0].shape)
 
-    def step(state, face):
+    def full(value: float) -> Any:
+        return library.full(shape, value, direction[0].dtype)
+
+    def of_face(state, face):
         normal, offset = face
         near, far = state
-        gap = _along(offset, origin) - _product(normal, origin)
-        gap = library.where(library.abs(gap) < 1e-9, 1e-9, gap)
-        inverse = _product(normal, direction) / gap
+        gap = offset - _product(normal, origin)
+        inverse = _product(normal, direction) / library.where(library.abs(gap) < 1e-9, 1e-9, gap)
         before = gap < 0.0
         near = library.where(before, library.minimum(near, inverse), near)
         return near, library.where(before, far, library.maximum(far, inverse))
 
-    shape = np.broadcast_shapes(origin[0].shape, direction[0].shape)
-    start = tuple(library.full((len(offset), *shape), value, direction[0].dtype) for value in (library.inf, 0.0))
-    near, far = _fold(step, start, (rows.normal, offset), library)
-    hit = (near > 0.0) & (near >= far) & library.isfinite(near)
-    return library.where(hit, 1.0 / library.where(hit, near, 1.0), library.inf)
+    def of_polyhedron(first, faces):
+        near, far = _fold(of_face, (full(library.inf), full(0.0)), faces, library)
+        hit = (near > 0.0) & (near >= far) & library.isfinite(near)
+        return library.minimum(first, library.where(hit, 1.0 / library.where(hit, near, 1.0), library.inf))
+
+    return _fold(of_polyhedron, full(library.inf), (rows.normal, offset), library)
 
 
 def reach(compound: Compound, direction: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:

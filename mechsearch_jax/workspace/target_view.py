@@ -21,12 +21,15 @@ from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.target import Target
 
+# Arrays of JAX or NumPy.
+Numbers = Array | np.ndarray
+
 
 def body_at(
     target: Target,
-    position: Float[Array, "*batch 3"],
-    rotation: Float[Array, "*batch 3 3"],
-    valid: Bool[Array, "*batch"],
+    position: Float[Numbers, "*batch 3"],
+    rotation: Float[Numbers, "*batch 3 3"],
+    valid: Bool[Numbers, "*batch"],
 ) -> Superquadrics:
     """The target at poses in the world, with the given leading axes; with `parts` if it is a compound.
 
@@ -51,9 +54,9 @@ def body_at(
 
 def main_body(
     target: Target,
-    position: Float[Array, "*batch 3"],
-    rotation: Float[Array, "*batch 3 3"],
-    valid: Bool[Array, "*batch"],
+    position: Float[Numbers, "*batch 3"],
+    rotation: Float[Numbers, "*batch 3 3"],
+    valid: Bool[Numbers, "*batch"],
 ) -> Superquadrics:
     """One superquadric that is in the target, where bodies of parts do not count: a compound's largest part.
 
