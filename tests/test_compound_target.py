@@ -127,7 +127,9 @@ def test_what_it_sweeps_is_around_it(target):
 
 def test_a_box_of_one_piece_is_grasped_square_to_its_sides_as_a_box_is():
     target = Target.from_parts((Piece("box", Target.box().half_size),))
-    poses = [np.asarray(grasp_tables(Gripper(), each, GraspConfig()).T_target_gripper) for each in (target, Target.box())]
+    poses = [
+        np.asarray(grasp_tables(Gripper(), each, GraspConfig()).T_target_gripper) for each in (target, Target.box())
+    ]
     own, usual = ({int(round(math.degrees(math.atan2(T[1, 2], T[0, 2])))) % 360 for T in each} for each in poses)
     assert own == usual == {0, 90, 180, 270}
 

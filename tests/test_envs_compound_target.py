@@ -29,6 +29,7 @@ from mechsearch_jax.envs.world.world import (
     TargetCompoundWorld,
     World,
     bodies_of,
+    fallen_over,
     from_scenario,
     slots,
     with_target,

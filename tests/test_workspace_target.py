@@ -97,7 +97,9 @@ def test_what_is_no_target_is_refused_in_one_line(tmp_path):
     with pytest.raises(InputError, match=r"Target\.friction"):
         Target.from_parts((box,), friction=float("nan"))
     with pytest.raises(InputError, match="tips it, but it stands upright"):
-        Target.of_body(Body(COMPOUND, (0.1,) * 3, (0.6, 0.1, 0.5), (0.0, 1.0, 0.0, 0.0), Target.from_parts((box,)).compound))
+        Target.of_body(
+            Body(COMPOUND, (0.1,) * 3, (0.6, 0.1, 0.5), (0.0, 1.0, 0.0, 0.0), Target.from_parts((box,)).compound)
+        )
     tall = Target.from_parts((Piece("box", (0.02, 0.02, 0.19)),))
     with pytest.raises(InputError, match=r"0\.380 m tall, but the shelf is 0\.\d+ m high"):
         tall.check_fits(Shelf())

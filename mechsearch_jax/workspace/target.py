@@ -227,7 +227,9 @@ class Target:
         """
         room = float(shelf.ceiling - shelf.board)
         if self.tall > room:
-            raise InputError(f"Target: {self.tall:.3f} m tall, but the shelf is {room:.3f} m high inside; use a lower one")
+            raise InputError(
+                f"Target: {self.tall:.3f} m tall, but the shelf is {room:.3f} m high inside; use a lower one"
+            )
 
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
         """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.
