@@ -157,7 +157,8 @@ def _target_grasps(
             f"Target: {min(widths):.3f} m wide, but the gripper takes {gripper.usable_opening} m; use a thinner target"
         )
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
-    yaw, tilt, wrist = np.float32(grasps[:, 0]), np.float32(grasps[:, 1]), grasps[:, 2].astype(int)
+    yaw, tilt = grasps[:, :2].T.astype(np.float32)
+    wrist = grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
     above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
     return _posed(yaw, tilt, above), wrist
@@ -187,7 +188,8 @@ def _compound_grasps(
             " open fingers reach from the side; use another target"
         )
     table = np.array(rows)
-    return _posed(np.float32(table[:, 0]), np.float32(table[:, 1]), np.float32(table[:, 3:])), table[:, 2].astype(int)
+    yaw, tilt, point = (table[:, columns].astype(np.float32) for columns in (0, 1, slice(3, None)))
+    return _posed(yaw, tilt, point), table[:, 2].astype(int)
 
 
 def feasible_grasps(

@@ -130,7 +130,7 @@ def test_a_box_of_one_piece_is_grasped_square_to_its_sides_as_a_box_is():
     poses = [
         np.asarray(grasp_tables(Gripper(), each, GraspConfig()).T_target_gripper) for each in (target, Target.box())
     ]
-    own, usual = ({int(round(math.degrees(math.atan2(T[1, 2], T[0, 2])))) % 360 for T in each} for each in poses)
+    own, usual = ({round(math.degrees(math.atan2(T[1, 2], T[0, 2]))) % 360 for T in each} for each in poses)
     assert own == usual == {0, 90, 180, 270}
 
 

@@ -137,7 +137,7 @@ MESH = {k: v for k, v in MUG.items() if k not in ("pieces", "color")} | {"mesh":
         (("objects", 0, "pieces", 1), {**WEDGE, "vertices": [[0, 0, 0]] * 3}, "vertices: must be a list of 4 to 48"),
         (("objects", 0, "pieces", 1), {**WEDGE, "vertices": [[0, 0, 0]] * 5}, "vertices: a piece is flat"),
         (("objects", 0, "position"), [0.3, 0.1, 0.45], "objects[0].position: x = 0.3 is off the board"),
-        (("objects", 0), MESH, "none.obj cannot be read (No such file or directory); its path counts from"),
+        (("objects", 0), MESH, "none.obj cannot be read (No such file or directory); a path in a file counts from"),
         (("objects", 0), {**MESH, "mesh": 3}, "objects[0].mesh: 3 must be the path of a mesh file"),
         (
             ("objects", 0),

@@ -54,8 +54,9 @@ def sight_of(camera: Camera, shelf: Shelf, target: Target | None = None) -> Sigh
     except InputError:
         # The oracle needs no view.
         view = None
-    larger = target is not None and target.compound is not None
-    return Sight(view, target_window(camera, target.half_size) if larger else target_window(camera))
+    if target is None or target.compound is None:
+        return Sight(view, target_window(camera))
+    return Sight(view, target_window(camera, target.half_size))
 
 
 @dataclasses.dataclass(frozen=True)

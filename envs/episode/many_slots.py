@@ -139,7 +139,7 @@ class ManySlots:
             *(Program("small ones", lambda: False, functools.partial(choosing, call)) for call in calls),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight, self._sensing),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
-            program("small ones", sizes_and_truths, problem.poses, state.belief.exists, world),
+            program("small ones", sizes_and_truths, problem, state.belief.exists, world),
             program("small ones", _forget, problem, state, fresh),
             program("small ones", _note, state, done, rows),
             program("small ones", _some_worlds, world, rows),

@@ -199,15 +199,16 @@ class OneSlot:
 
 def summary(problem: Problem, belief: Belief, truth: Truth, world: World) -> BeliefSummary:
     """The beliefs of all slots; all fields, of the world in the base's frame, have a leading axis for them."""
-    size, possible = sizes_and_truths(problem.poses, belief.exists, world)
+    size, possible = sizes_and_truths(problem, belief.exists, world)
     fields = belief.found, size, possible, belief.restarts, truth.shown, truth.bodies, truth.there
     return BeliefSummary(*jax.device_get(fields))
 
 
 @kept()
-def sizes_and_truths(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
+def sizes_and_truths(problem: Problem, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
     """Number of candidate poses where the target can be, and whether it can be at the one nearest to the truth."""
-    nearest = jax.vmap(lambda single: nearest_candidate(poses, true_target_pose(single)))(world)
+    poses, turn = problem.poses, problem.target.turn
+    nearest = jax.vmap(lambda single: nearest_candidate(poses, true_target_pose(single), turn))(world)
     return jnp.sum(exists, axis=1), jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
 
 

@@ -147,9 +147,9 @@ class Painter:
         """
         world = last_world(self._recording.steps[-1])
         scene = objects_of(world, self._camera, self._shelf)
-        body = (np.asarray(a)[TARGET] for a in (world.position, world.rotation))
+        position, rotation = (np.asarray(a)[TARGET] for a in (world.position, world.rotation))
         episode, alike = self._recording.episode, self._target.solid.ends_alike
-        upright = target_trouble(self._shelf, *body, alike) is None
+        upright = target_trouble(self._shelf, position, rotation, alike) is None
         stands = upright and not (episode is not None and episode.retrieved)
         pose = np.asarray(true_target_pose(jax.tree.map(jnp.asarray, world))) if stands else None
         blockers = tuple(i for i in blocking if scene.valid[i])

@@ -155,7 +155,7 @@ def between(
     across = R_body_gripper[:, 1]
     starts = point + _pad_lines(R_body_gripper)
     lateral = np.arange(-opening / 2, opening / 2 + ALONG / 2, ALONG)
-    material = field.at(starts[:, None] + lateral[None, :, None] * across) < 0.0
+    material = np.less(field.at(starts[:, None] + lateral[None, :, None] * across), 0.0)
     there = material.any(axis=1)
     ends = np.stack([lateral[material.argmax(axis=1)], lateral[::-1][material[:, ::-1].argmax(axis=1)]], axis=1)
     return np.where(there[:, None], ends, np.nan), starts

@@ -58,6 +58,6 @@ def field_of(compound: Compound) -> Field:
     step = max(STEP, float(np.prod(high - low) / CELLS) ** (1 / 3))
     axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    flat = np.float32(points.reshape(-1, 3))
+    flat = points.reshape(-1, 3).astype(np.float32)
     values = [union.distance(compound, list(flat[i : i + BLOCK].T), np) for i in range(0, len(flat), BLOCK)]
     return Field(low, step, np.concatenate(values).reshape(points.shape[:-1]))

@@ -268,7 +268,7 @@ def surface(compound: Compound, count: int, erosion: float = 0.0) -> Float[np.nd
     import trimesh
 
     whole: Any = trimesh.util.concatenate(Union(compound).hulls(erosion))
-    points, face = trimesh.sample.sample_surface(whole, 4 * count, seed=0)
+    points, face = trimesh.sample.sample_surface(whole, 4 * count, seed=0)[:2]
     # Where solids touch or overlap, there is another one just outside of a surface.
     outside = np.asarray(points) + JUST_OUTSIDE * np.asarray(whole.face_normals)[face]
     free = np.asarray(points)[~union.inside(compound, outside, erosion)]

@@ -144,7 +144,7 @@ class Target:
         _, x, y, _ = body.quaternion
         if 1 - 2 * (x * x + y * y) < UPRIGHT:
             raise InputError(
-                f"Target: its quaternion {body.quaternion} tips it, but it stands upright; turn its pieces instead, z up"
+                f"Target: quaternion {body.quaternion} tips it, but it stands upright; turn its pieces instead, z up"
             )
         return cls.of_compound(body.compound)
 

@@ -6,6 +6,8 @@ its own images and points are those of its exact pieces: they decide where it ca
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,7 @@ from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.target import Target
 
 # Arrays of JAX or NumPy.
-Numbers = Array | np.ndarray
+Numbers = Any
 
 
 def body_at(
@@ -37,14 +39,15 @@ def body_at(
     """
     parts = None
 
-    def constant(row: np.ndarray) -> Array:
+    def constant(row: Any) -> Array:
         return jnp.asarray(np.broadcast_to(row, (*valid.shape, *row.shape)))
 
     if target.compound is not None:
-        parts = Superquadrics(*(constant(row) for row in part_rows(target.compound)))
+        rows: Any = (constant(row) for row in part_rows(target.compound))
+        parts = Superquadrics(*rows)
     return Superquadrics(
-        size=constant(np.float32(target.half_size)),
-        exponents=constant(np.float32(target.exponents)),
+        size=constant(np.array(target.half_size, np.float32)),
+        exponents=constant(np.array(target.exponents, np.float32)),
         position=position,
         rotation=rotation,
         valid=valid,
@@ -90,7 +93,7 @@ def window_image(
     middle = (stride - 1) / 2.0
     along = pixel_rays(camera, rows * stride + corner[0] + middle, columns * stride + corner[1] + middle)
     R, offset = T_world_target[:3, :3], jnp.array(camera.position) - T_world_target[:3, 3]
-    origin = [sum(offset[j] * R[j, i] for j in range(3)).reshape(1, 1) for i in range(3)]
+    origin = [jnp.reshape(sum(offset[j] * R[j, i] for j in range(3)), (1, 1)) for i in range(3)]
     local = [sum(along[..., j] * R[j, i] for j in range(3)) for i in range(3)]
     return render.Window(union.cut(target.compound, origin, local, 0.0, jnp), corner, stride)
 
@@ -98,7 +101,8 @@ def window_image(
 def extent(target: Target) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
     """The middle of the smallest box around the target along its axes, and its half-extents [m], float32."""
     against, along = target.solid.extent(np.eye(3), np)
-    return np.float32((along - against) / 2), np.float32((along + against) / 2)
+    middle, half = np.stack([along - against, along + against]).astype(np.float32) / 2
+    return middle, half
 
 
 def framed(target: Target, T_world_target: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
@@ -127,4 +131,4 @@ def surface_cloud(target: Target, count: int, erosion: float) -> Float[np.ndarra
         sample = jax.jit(superquadric.sample_surface, static_argnames="count")
         half = np.array(target.half_size, np.float32) - np.float32(erosion)
         return np.asarray(sample(half, np.array(target.exponents, np.float32), count=count))
-    return np.float32(solid.surface(target.compound, count, erosion))
+    return solid.surface(target.compound, count, erosion).astype(np.float32)
