@@ -156,7 +156,7 @@ def between(
     starts = point + _pad_lines(R_body_gripper)
     lateral = np.arange(-opening / 2, opening / 2 + ALONG / 2, ALONG)
     material = np.less(field.at(starts[:, None] + lateral[None, :, None] * across), 0.0)
-    there = material.any(axis=1)
+    there = np.any(material, axis=1)
     ends = np.stack([lateral[material.argmax(axis=1)], lateral[::-1][material[:, ::-1].argmax(axis=1)]], axis=1)
     return np.where(there[:, None], ends, np.nan), starts
 
