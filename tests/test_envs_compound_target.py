@@ -57,7 +57,6 @@ MUG = Target.from_parts(
     ),
     density=500.0,
     friction=0.5,
-    colour=(0.1, 0.2, 0.9),
 )
 WEDGE = ((-0.025, -0.02, -0.04), (0.025, -0.02, -0.04), (-0.025, 0.02, -0.04), (0.025, 0.02, -0.04), (0.0, 0.0, 0.06))
 TENT = Target.from_parts((Piece(CONVEX, (0.0, 0.0, 0.0), vertices=WEDGE),))

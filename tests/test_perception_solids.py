@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.perception.doubt import Thing, _surface_distance
+from mechsearch_jax.perception.doubt import Thing
 from mechsearch_jax.perception.overlaps import depth_in_each_other
 from mechsearch_jax.perception.solids import entries, penetrations, surface_distance
 from mechsearch_jax.workspace.render import object_depth
@@ -36,7 +36,7 @@ def things(objects):
 def test_distances_are_those_of_the_check_of_recognition(objects):
     points = np.float32([0.6, 0.0, 0.9]) + np.random.default_rng(1).uniform(-0.2, 0.2, (500, 3)).astype(np.float32)
     signed = np.asarray(surface_distance(objects, jnp.asarray(points)))
-    expected = [_surface_distance(thing, thing.local(points - thing.position)) for thing in things(objects)]
+    expected = [thing.gap(points) for thing in things(objects)]
     np.testing.assert_allclose(np.abs(signed), expected, atol=1e-5)
     assert (signed < 0).any()
     assert (signed > 0).any()
