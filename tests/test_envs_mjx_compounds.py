@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_envs_simulator import pose, take_out
 
 from mechsearch_jax.envs.scenes.household import body_at, household, standing_height
 from mechsearch_jax.envs.simulators.batch_model import cells_of
@@ -25,7 +24,6 @@ from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, hal
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 BOX = Body("box", (0.054, 0.025, 0.054), (0.55, 0.3, 0.4585), UPRIGHT)
@@ -216,24 +214,3 @@ def test_things_come_to_rest_where_the_native_simulator_has_them():
         assert np.abs(apart).max() < 2e-3
         cosine = (np.einsum("nij,nij->n", batch.world.rotation[i], native.world.rotation)[:count] - 1) / 2
         assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 3.0
-
-
-@pytest.mark.slow
-def test_a_target_of_pieces_or_polyhedra_is_taken_out():
-    mug = Target.from_parts((Piece("cylinder", (0.03, 0.03, 0.045)), Piece("box", (0.012, 0.005, 0.02), (0.04, 0, 0))))
-    box = Target.from_parts((Piece(CONVEX, (0.0,) * 3, vertices=CORNERS),))
-    for target in (mug, box):
-        place = (0.6, 0.1, Shelf().board + target.bottom)
-        body = Body(target.shape, target.half_size, place, (0.0, 0.0, 0.0, 1.0), target.compound)
-        scene = Scenario("alone", (dataclasses.replace(BOX, position=(0.7, 0.35, 0.4585)),), body)
-        batch, native = MjxSimulator(), NativeWorld()
-        batch.reset([scene, scene])
-        native.reset(scene)
-        assert batch.settle().settled.all()
-        assert native.settle().settled
-        assert np.abs(np.asarray(batch.world.position - native.world.position[None]))[:, [0, TARGET]].max() < 1e-3
-        action = take_out(pose(0.6, 0.1, 0.04))
-        outcome = batch.execute(jax.tree.map(lambda leaf: np.stack([leaf] * 2), action))
-        assert not outcome.overflow.any()
-        assert native.execute(action).retrieved
-        assert outcome.retrieved.all(), outcome.reason(0)
