@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from mechsearch_jax.compound_grasps import closings
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
-from mechsearch_jax.robot.compound_grasps import closings
 from mechsearch_jax.robot.entry import WaysIn, gripper_enters
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
@@ -172,7 +172,7 @@ def _posed(yaw: np.ndarray, tilt: np.ndarray, point: np.ndarray) -> Float[Array,
 def _compound_grasps(
     target: Target, compound: Compound, gripper: Gripper, config: GraspConfig
 ) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
-    """`_target_grasps` of a target of pieces: each closing of `robot.compound_grasps` at the tilts that it allows."""
+    """`_target_grasps` of a target of pieces: each closing of `compound_grasps` at the tilts that it allows."""
     directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
     yaws = directions.tolist() if target.solid.round else None
     found = closings(compound, gripper, yaws, config.tilts, config.height)

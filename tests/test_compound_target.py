@@ -15,6 +15,7 @@ import mechsearch_jax as ms
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.belief import with_target
+from mechsearch_jax.compound_grasps import between, grip_between
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import existence_tables
 from mechsearch_jax.geometry.superquadric import empty
@@ -22,7 +23,6 @@ from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import GraspConfig, grasp_tables
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.robot.compound_grasps import between, grip_between
 from mechsearch_jax.robot.gripper import Gripper, primitives_in_gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import union

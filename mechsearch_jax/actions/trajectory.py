@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.compound_grasps import grip_between
 from mechsearch_jax.geometry.bodies import grasped_shape
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
-from mechsearch_jax.robot.compound_grasps import grip_between
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import (
     Grip,
