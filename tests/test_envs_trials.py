@@ -60,6 +60,7 @@ def objects_and_pose(problem, objects):
 EDGE = (standing("cylinder", (0.024, 0.024, 0.067), 0.43, 0.1), standing("box", (0.054, 0.025, 0.054), 0.6, 0.2))
 SCENES = {"open": OPEN, "loose": LOOSE, "firm": FIRM}
 DONE, FAILED, HARM, UNKNOWN = TrialResult.SUCCEEDED, TrialResult.FAILED, TrialResult.HARMFUL, TrialResult.UNKNOWN
+UNSURE = TrialResult.UNSURE
 
 
 def stack(*trees):
@@ -174,7 +175,9 @@ def test_a_retrieval_is_tried_in_each_scene_nearby_until_it_fails_and_a_push_onc
     seen, at = objects_and_pose(problem, OPEN)
     grasp, push = jax.tree.map(lambda a: a[:1], retrievals["open"][0].action), stack(pushes()[2])
     for codes, action, result, calls in (
-        ((DONE, DONE, FAILED), grasp, FAILED, 3),
+        ((DONE, DONE, FAILED), grasp, UNSURE, 3),
+        ((DONE, HARM), grasp, HARM, 2),
+        ((DONE, UNKNOWN), grasp, UNKNOWN, 2),
         ((DONE,) * 4, grasp, DONE, 4),
         ((FAILED,), grasp, FAILED, 1),
         ((DONE, FAILED), push, DONE, 1),
@@ -196,7 +199,7 @@ def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, retrievals)
     for name in ("loose", "firm"):
         tried, results = retrievals[name]
         world.reset(begin(SCENES[name]))
-        first = int(np.argmax(results))
+        first = int(np.argmax(results == DONE))
         outcome = world.execute(jax.tree.map(lambda a, i=first: a[i], tried.action))
         assert bool(outcome.retrieved) == bool(results[first] == DONE)
 
@@ -328,6 +331,33 @@ def test_a_grasp_that_hits_nothing_is_made_only_if_its_trial_does_not_fail(probl
             np.testing.assert_array_equal(decision.action.T_world_gripper, plain.action.T_world_gripper)
 
 
+def test_an_unsure_grasp_is_made_only_where_no_other_action_is_allowed(problem):
+    _, _, aside = pushes()
+    belief, observation = look(problem, OPEN)
+    grasps = proposes(aside).retrieval(jax.random.key(0), problem, belief, observation).alternatives
+    assert grasps.worth[:3].all()
+    for codes, last, row in (
+        ((FAILED, UNSURE, UNSURE), False, None),
+        ((FAILED, UNSURE, UNSURE), True, 1),
+        ((UNSURE, FAILED, DONE), True, 2),
+        ((FAILED, HARM, FAILED), True, None),
+    ):
+        trials = grasps_fail_as([*codes, *[FAILED] * (TRIES - 3)])
+        arguments = proposes(aside), trials, jax.random.key(0), problem, belief, observation
+        decision = decide(*arguments, last=last)
+        assert int(decision.action.kind) == (ActionKind.PUSH if row is None else ActionKind.RETRIEVE)
+        if row is not None:
+            expected = grasps.actions.T_world_gripper[row]
+            np.testing.assert_array_equal(decision.action.T_world_gripper, expected)
+        # As in many slots.
+        slots, keys = slots_of(problem, proposes(aside), trials, [(OPEN, True), (OPEN, True)])
+        choices = slots.decide(keys, [0, 1], [0] if last else [])
+        assert int(choices[0].action.kind) == int(decision.action.kind)
+        without = grasps_fail_as([FAILED if c == UNSURE else c for c in codes] + [FAILED] * (TRIES - 3))
+        other = decide(proposes(aside), without, *arguments[2:])
+        assert int(choices[1].action.kind) == int(other.action.kind)
+
+
 def grasps_fail_as(codes):
     """Trials in which grasps have these results and all else succeeds."""
 
@@ -386,7 +416,7 @@ def test_one_choice_among_grasps_and_actions_is_what_two_in_turn_are(problem, ob
         def trials(problem, scenes, proposed, wanted, results=results):
             return (results[:count] if (proposed.kind == ActionKind.RETRIEVE).any() else results[count:])[None]
 
-        chosen = choose(both, jnp.asarray(results))
+        chosen = choose(both, jnp.asarray(results), jnp.array(False))
         in_turn = made(policy, trials, problem, belief, observation)
         for name in ("action", "value", "cost", "predicted_cost", "predicted", "sequences", "refused"):
             jax.tree.map(np.testing.assert_array_equal, getattr(chosen, name), getattr(in_turn, name))
@@ -511,7 +541,7 @@ def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(prob
     wanted = np.array([[True, True, True], [True, True, True], [False, False, False]])
     results = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
     assert results[0].tolist() == [HARM, FAILED, DONE]
-    assert int(np.argmax(results[1])) == int(np.argmax(retrievals["loose"][1]))
+    assert int(np.argmax(results[1] == DONE)) == int(np.argmax(retrievals["loose"][1] == DONE))
     assert results[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 

@@ -193,7 +193,7 @@ class EpisodePool:
         # After the last action the target may still be taken out, where it is found.
         deciding = [r for r in logs if r not in trouble and (found[r] or not logs[r].last)]
         with clock("plan", deciding):
-            choices = self._planner.decide(planner_keys, deciding)
+            choices = self._planner.decide(planner_keys, deciding, [r for r in deciding if logs[r].last])
         # `Slots` number objects as they were recognised, the simulator and records number bodies.
         choices = {
             r: choice.replace(bodies=knowledge.bodies[r], there=knowledge.there[r])

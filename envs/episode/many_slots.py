@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import flax.struct
@@ -131,7 +131,7 @@ class ManySlots:
             results = None
             if self._trials is not None and decision.alternatives is not None:
                 results = jax.ShapeDtypeStruct(decision.alternatives.worth.shape, np.int32)
-            return _choose.begin(decision, results)
+            return _choose.begin(decision, results, active)
 
         return [
             *(program("plan", _propose, *call) for call in calls),
@@ -183,21 +183,21 @@ class ManySlots:
             self._learned.learn(self._problem, rows, *jax.tree.map(lambda a: a[list(rows)], jax.device_get(searches)))
         return summary(self._problem, self._state.belief, self._state.truth, in_base(world, self._sensing))
 
-    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+    def decide(self, keys: Array, rows: Sequence[int], last: Collection[int] = ()) -> dict[int, Choice]:
         """See `Slots`.
 
         Whether to take a target out is decided only where it is found, and a plan made only where it is not taken out.
         What is worth trying out is tried in all slots together.
         """
         if not isinstance(self._policy, AsksTwice):
-            return self._ask(ANYTHING, keys, rows)
+            return self._ask(ANYTHING, keys, rows, last)
         there = np.asarray(self._state.belief.found)
-        choices = self._ask(RETRIEVAL, keys, [r for r in rows if there[r]])
+        choices = self._ask(RETRIEVAL, keys, [r for r in rows if there[r]], last)
         choices = {r: choice for r, choice in choices.items() if takes_target(choice)}
-        choices |= self._ask(FOUND, keys, [r for r in rows if there[r] and r not in choices])
-        return choices | self._ask(HIDDEN, keys, [r for r in rows if not there[r]])
+        choices |= self._ask(FOUND, keys, [r for r in rows if there[r] and r not in choices], last)
+        return choices | self._ask(HIDDEN, keys, [r for r in rows if not there[r]], last)
 
-    def _ask(self, question: Question, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+    def _ask(self, question: Question, keys: Array, rows: Sequence[int], last: Collection[int]) -> dict[int, Choice]:
         """What the policy answers to a question in the slots of a chunk, after trials; see `_propose`."""
         chunks = list(self._chunks(rows))
         proposed = []
@@ -210,7 +210,8 @@ class ManySlots:
         for (chunk, padded), (decision, _), results in zip(
             chunks, proposed, self._tried([chunk for chunk, _ in chunks], proposed), strict=True
         ):
-            decided = _choose(decision, results)
+            over = np.array([r in last for r in chunk] + [False] * (self._at_once - len(chunk)))
+            decided = _choose(decision, results, jax.device_put(over))
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             choices |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(chunk)}
@@ -369,10 +370,10 @@ def _propose(
 
 
 @kept()
-def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
-    """What decisions come down to after trials, of which there may have been none."""
+def _choose(decisions: Decision, results: Int[Array, "n k"] | None, last: Bool[Array, " n"]) -> Choice:
+    """What decisions come down to after trials, of which there may have been none; `last` as for `choose`."""
     if results is not None:
-        decisions = jax.vmap(choose)(decisions, results)
+        decisions = jax.vmap(choose)(decisions, results, last)
     return jax.vmap(chosen)(decisions)
 
 

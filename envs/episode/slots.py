@@ -8,7 +8,7 @@ traceable.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
 import jax
@@ -86,8 +86,14 @@ class Slots(Protocol):
         """
         ...
 
-    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
-        """The policy's choices in the slots `rows`; `keys` are the planner's, one for each slot."""
+    def decide(self, keys: Array, rows: Sequence[int], last: Collection[int] = ()) -> dict[int, Choice]:
+        """The policy's choices in the slots `rows`.
+
+        Args:
+          keys: the planner's, one for each slot.
+          rows: the slots.
+          last: those in which no action after this one is allowed.
+        """
         ...
 
     def took(self, actions: Mapping[int, Action]) -> None:
@@ -167,14 +173,16 @@ class OneSlot:
         belief, seen = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), (self.belief, self.truth))
         return summary(self._problem, belief, seen, in_base(world, self._sensing))
 
-    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+    def decide(self, keys: Array, rows: Sequence[int], last: Collection[int] = ()) -> dict[int, Choice]:
         """See `Slots`."""
         if not rows:
             return {}
         assert self.observation is not None
         trials = self._trials if self._learned is None else self._learned.trials([0])
         self.noted = None if trials is None else NotedTrials(trials)
-        self.decision = decide(self._policy, self.noted, keys[0], self._problem, self.belief, self.observation)
+        self.decision = decide(
+            self._policy, self.noted, keys[0], self._problem, self.belief, self.observation, 0 in last
+        )
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
 

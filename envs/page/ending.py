@@ -168,6 +168,8 @@ def _warned(recording: Recording, i: int) -> str:
         hits = step.evidence.hits
         touched = "" if free(hits) or not len(hits) else f" No grasp was free: {grasps_in_words(hits)}."
         return f" In its trial this grasp had taken the target out.{touched}"
+    if result is TrialResult.UNSURE:
+        return " In its trial this grasp had taken the target out, but not in every scene nearby: a last resort."
     if result is TrialResult.SUCCEEDED:
         return f" It had been tried out beforehand and did no harm in the trial.{hidden}"
     if result is TrialResult.FAILED:

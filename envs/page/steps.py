@@ -35,6 +35,7 @@ RESULTS = {
     TrialResult.SUCCEEDED: ("good", "went as intended"),
     TrialResult.FAILED: ("poor", "not carried out as intended: held up, out of reach, or out of the hand"),
     TrialResult.HARMFUL: ("bad", "harm: something fell off the board, or the found target fell over"),
+    TrialResult.UNSURE: ("poor", "the target was taken out here, but not in every scene nearby"),
     TrialResult.UNKNOWN: ("poor", "no result: it could not be simulated"),
 }
 # What stands for what nobody knows.
@@ -192,8 +193,8 @@ def trials(step: RecordedStep) -> list[Trial]:
         verdict = "chosen" if made else "not better" if result is TrialResult.SUCCEEDED else passed
         colour, words = RESULTS[result]
         if kind.takes_target and result is not TrialResult.SUCCEEDED:
-            known = result is not TrialResult.UNKNOWN
-            words = "the target was not taken out, here or in a scene nearby" if known else "no result"
+            failed = "the target was not taken out, here or in a scene nearby"
+            words = {TrialResult.UNSURE: words, TrialResult.UNKNOWN: "no result"}.get(result, failed)
             colour, verdict = "poor", "chosen" if made else "passed over"
         rows.append(Trial(kind.describe(single, step.scene.capacity), words, colour, verdict))
     # Grasps of the target are alike in words.

@@ -64,8 +64,8 @@ class NativeTrials:
     """The `Trials` in C MuJoCo, of many scenes at once, on several threads.
 
     The same trials always give the same results. An action that the arm cannot follow fails; the result is UNKNOWN if
-    the simulation diverges or the scene is invalid. The gripper is the problem's. A retrieval succeeds only if it does
-    so in some scenes near the recognised one as well.
+    the simulation diverges or the scene is invalid. The gripper is the problem's. A retrieval that succeeds
+    is unsure unless it does so in a few scenes near the recognised one as well.
 
     Attributes:
       simulation: its settings.
@@ -130,7 +130,7 @@ class NativeTrials:
                     return None
                 result = _attempted(near[number], kind, motion[0], int(action.object), needed)
                 if result is not TrialResult.SUCCEEDED:
-                    break
+                    return TrialResult.UNSURE if number and result is TrialResult.FAILED else result
             return result
 
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)

@@ -38,17 +38,19 @@ PLANNED = tuple(ActionKind(kind.code) for kind in SAMPLED_KINDS)
 
 
 class TrialResult(enum.IntEnum):
-    """Result of an action's trial, from bad to good.
+    """Result of an action's trial.
 
     `UNKNOWN`: it was not tried, or its simulation diverged or had too little room. `HARMFUL`: something leaves the
     board, or the found target falls over. `FAILED`: it is not executed as intended. `SUCCEEDED`: it is; a retrieval
-    takes the target out.
+    takes the target out. `UNSURE`: a retrieval takes the target out of the scene as it is recognised, but fails in one
+    near it, without harm.
     """
 
     UNKNOWN = 0
     HARMFUL = 1
     FAILED = 2
     SUCCEEDED = 3
+    UNSURE = 4
 
 
 class TrialScenes(flax.struct.PyTreeNode):
@@ -103,7 +105,13 @@ class AsksTwice(Protocol):
 
 
 def decide(
-    policy, trials: Trials | None, key: Array, problem: Problem, belief: Belief, observation: Observation
+    policy,
+    trials: Trials | None,
+    key: Array,
+    problem: Problem,
+    belief: Belief,
+    observation: Observation,
+    last: bool = False,
 ) -> Decision:
     """Decide for a single scene: the policy proposes, trials try, `choose` chooses. On the host.
 
@@ -113,19 +121,25 @@ def decide(
       policy: see `policies.Policy`; one that `AsksTwice` plans only if no grasp succeeds.
       trials: tries the alternatives; None for no trials.
       key, problem, belief, observation: as for the policy.
+      last: whether no further action is allowed; see `choose`.
     """
     arguments = (key, problem, belief, observation)
     if trials is None or not isinstance(policy, AsksTwice):
-        return tried(trials, problem, belief, observation, policy(*arguments))
+        return tried(trials, problem, belief, observation, policy(*arguments), last)
     if belief.found:
-        decision = tried(trials, problem, belief, observation, policy.retrieval(*arguments))
+        decision = tried(trials, problem, belief, observation, policy.retrieval(*arguments), last)
         if int(decision.action.kind) == ActionKind.RETRIEVE:
             return decision
-    return tried(trials, problem, belief, observation, policy.planned(*arguments))
+    return tried(trials, problem, belief, observation, policy.planned(*arguments), last)
 
 
 def tried(
-    trials: Trials | None, problem: Problem, belief: Belief, observation: Observation, decision: Decision
+    trials: Trials | None,
+    problem: Problem,
+    belief: Belief,
+    observation: Observation,
+    decision: Decision,
+    last: bool = False,
 ) -> Decision:
     """A decision after trials of its alternatives; unchanged without alternatives or trials."""
     alternatives = decision.alternatives
@@ -134,7 +148,7 @@ def tried(
     scene = scenes_of(belief, observation)
     scenes, rows = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get((scene, alternatives)))
     results = trials(problem, scenes, rows.actions, rows.worth)
-    return choose(decision, jnp.asarray(results[0], jnp.int32))
+    return choose(decision, jnp.asarray(results[0], jnp.int32), jnp.array(last))
 
 
 def scenes_of(belief: Belief, observation: Observation) -> TrialScenes:
@@ -202,23 +216,28 @@ def in_turn(first: Alternatives, then: Alternatives) -> Alternatives:
 
 
 @kept()
-def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
+def choose(decision: Decision, results: Int[Array, " k"], last: Bool[Array, ""]) -> Decision:
     """Choose an action by the results of trials.
 
-    A grasp that succeeds is chosen first. Else a retrieval that the decision already makes is kept if the results of
-    all grasps are unknown. Else the first other alternative that succeeds is chosen, else the first that begins a
-    sequence and did no harm, else nothing. Sequences whose first action did harm, or has an unknown result, or is like
-    one of these, are refused. A decision without alternatives stays unchanged.
+    A grasp that succeeds is chosen first, or, where no further action is allowed and none does, an unsure one. Else a
+    retrieval that the decision already makes is kept if the results of all grasps are unknown. Else the first other
+    alternative that succeeds is chosen, else the first that begins a sequence and did no harm, else nothing. Sequences
+    whose first action did harm, or has an unknown result, or is like one of these, are refused. A decision without
+    alternatives stays unchanged.
 
     Args:
       decision: decision of a policy.
       results: the `TrialResult` of each alternative.
+      last: whether no further action is allowed.
     """
     sequences, alternatives = decision.sequences, decision.alternatives
     if alternatives is None:
         return decision
     results = jnp.where(alternatives.worth, results, TrialResult.UNKNOWN)
     grasps = alternatives.sequence < 0
+    certain = jnp.any(grasps & (results == TrialResult.SUCCEEDED))
+    unsure = jnp.where(last & ~certain, TrialResult.SUCCEEDED, TrialResult.FAILED)
+    results = jnp.where(results == TrialResult.UNSURE, unsure, results)
     takes = decision.action.kind == ActionKind.RETRIEVE
     # A grasp counts only if it succeeds.
     best = jnp.argmax(jnp.where(grasps & (results < TrialResult.SUCCEEDED), -1, results))

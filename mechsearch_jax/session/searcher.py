@@ -375,7 +375,8 @@ class Searcher:
         for draw in range(DRAWS):
             draw_key = jax.random.fold_in(key, draw) if draw else key
             noted = NotedTrials(trials) if trials is not None and self._view is not None else None
-            decision = decide(self._policy, noted or trials, draw_key, problem, belief, observation)
+            last = self._now.index >= self.config.max_steps
+            decision = decide(self._policy, noted or trials, draw_key, problem, belief, observation, last)
             motion = motion_of(problem, belief, observation, decision, depth, present, arm, self._motions)
             if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
