@@ -1,18 +1,20 @@
 """Worlds that are not as the planner assumes: what the simulator and the camera make of a `Mismatch`."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from stage import HIDDEN, OPEN, Stage, grab
 
 from mechsearch_jax.actions import KINDS, ActionKind
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
-from mechsearch_jax.envs.camera.sensing import OtherNoise, sensing_of, true_camera
+from mechsearch_jax.envs.camera.sensing import OtherNoise, Sensing, resized, sensing_of, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
@@ -27,6 +29,7 @@ from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls, 
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
 from mechsearch_jax.envs.world.model import body_geometries
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
+from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.noise import no_noise
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -165,6 +168,58 @@ def test_a_shift_moves_what_the_oracle_sees_by_as_much(eyes, name):
     np.testing.assert_allclose(shift, np.broadcast_to(way, shift.shape), atol=1e-6)
 
 
+@pytest.mark.parametrize("eyes", [oracle, informed])
+def test_objects_are_recognised_as_large_as_their_spread_says_and_stand_where_they_did(eyes):
+    mismatch = Mismatch(size_spread=1.05)
+    seen, truth = (eyes(jax.random.key(0), snapshot(m)) for m in (mismatch, ASSUMED))
+    there = np.asarray(truth.objects.valid)
+    factors = np.asarray(seen.objects.size / truth.objects.size)[there]
+    np.testing.assert_allclose(factors, cell_of(mismatch).seen_size[:TARGET][there], rtol=1e-5)
+    assert 1 / 1.05 <= factors.min() < 0.99
+    assert 1.01 < factors.max() <= 1.05
+    for name in ("rotation", "exponents", "valid"):
+        np.testing.assert_array_equal(getattr(seen.objects, name), getattr(truth.objects, name))
+    np.testing.assert_array_equal(seen.target_pose, truth.target_pose)
+    # They stand upright here.
+    moved = np.asarray(seen.objects.position - truth.objects.position)[there]
+    np.testing.assert_allclose(moved[:, :2], 0.0, atol=1e-7)
+    higher = np.asarray(seen.objects.size - truth.objects.size)[there, 2]
+    np.testing.assert_allclose(moved[:, 2], higher, atol=1e-6)
+    # The same share of every spread, and none of the others' draws.
+    other = Mismatch(size_spread=1.1, friction_spread=2.0)
+    shares = [np.log(cell_of(m).seen_size) / np.log(m.size_spread) for m in (mismatch, other)]
+    np.testing.assert_allclose(*shares)
+    np.testing.assert_array_equal(cell_of(other).body_friction, cell_of(Mismatch(friction_spread=2.0)).body_friction)
+
+
+def test_a_lying_box_and_a_body_of_parts_stay_on_the_board():
+    turned = Rotation.from_euler("xyz", [[90.0, 0.0, 20.0], [0.0, 0.0, 70.0]], degrees=True).as_matrix()
+    half = np.array([[0.03, 0.04, 0.08], [0.05, 0.05, 0.05]])
+    scene = Superquadrics(
+        size=jnp.array(half, jnp.float32),
+        exponents=jnp.full((2, 2), 0.2),
+        position=jnp.array([[0.5, 0.1, 0.44], [0.6, -0.1, 0.45]], jnp.float32),
+        rotation=jnp.array(turned, jnp.float32),
+        valid=jnp.ones(2, bool),
+    )
+    factors = np.array([[0.96, 1.05, 1.02], [1.03, 0.97, 1.04]], np.float32)
+    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+
+    def lowest(objects):
+        corners = signs[None] * np.asarray(objects.size)[:, None]
+        return (np.asarray(objects.position)[:, None] + corners @ turned.transpose(0, 2, 1))[..., 2].min(axis=1)
+
+    larger = resized(scene, Sensing(sizes=factors))
+    np.testing.assert_allclose(larger.size, half * factors, rtol=1e-6)
+    np.testing.assert_allclose(lowest(larger), lowest(scene), atol=1e-6)
+    pieces = empty(2, 2).parts.replace(size=jnp.full((2, 2, 3), 0.02), position=jnp.full((2, 2, 3), 0.01))
+    both = resized(scene.replace(parts=pieces), Sensing(sizes=factors))
+    mean = np.exp(np.log(factors).mean(axis=1))
+    np.testing.assert_allclose(both.parts.size, 0.02 * np.broadcast_to(mean[:, None, None], (2, 2, 3)), rtol=1e-5)
+    np.testing.assert_allclose(both.parts.position, 0.5 * both.parts.size, rtol=1e-5)
+    np.testing.assert_allclose(both.size, half * mean[:, None], rtol=1e-5)
+
+
 @pytest.mark.parametrize("mismatch", [Mismatch(camera_turn=2.0, camera_shift=0.02), Mismatch(shelf_turn=2.0)])
 def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
     masks = dataclasses.replace(recogniser("masks", target_of(SCENE)), noise=no_noise)
@@ -262,6 +317,12 @@ def test_what_cannot_be_simulated_is_refused():
             with pytest.raises(InputError, match="--recognition masks or full"):
                 Method(recognition=recognition, mismatch=mismatch).check()
         Method(recognition="masks", mismatch=mismatch).check()
+    for recognition in ("masks", "full"):
+        with pytest.raises(InputError, match=r"--size-spread: .* take --recognition oracle or informed"):
+            Method(recognition=recognition, mismatch=Mismatch(size_spread=1.05)).check()
+    Method(mismatch=Mismatch(size_spread=1.05)).check()
+    with pytest.raises(InputError, match="size_spread"):
+        Mismatch(size_spread=0.9)
     with pytest.raises(InputError, match="add --simulator native"):
         Method(engine="MjxSimulator", mismatch=Mismatch(physics="fine-step")).check()
     Method(mismatch=Mismatch(physics="fine-step")).check()

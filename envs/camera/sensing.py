@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Key
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing
 from mechsearch_jax.envs.world.mismatch import ActualCell, Mismatch
-from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.geometry.footprints import extents
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, matmul, transform
 from mechsearch_jax.images.noise import scattered
@@ -62,16 +63,18 @@ class Sensing(flax.struct.PyTreeNode):
       place: where the world is; None where the planner takes it to be.
       noise: of the depth; None for the recogniser's.
       colour: of the colour image; None for the recogniser's.
+      sizes: factors on the objects' true half-extents along their own axes, shape (..., 8, 3); None for none.
     """
 
     place: Place | None = None
     noise: OtherNoise | None = None
     colour: ColourSensing | None = None
+    sizes: jax.Array | np.ndarray | None = None
 
 
 def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
     """The sensing of an episode, as NumPy arrays; None if it is as the planner assumes."""
-    place, noise, colour = None, None, None
+    place, noise, colour, sizes = None, None, None, None
     if mismatch.moves_camera:
         T_base_world = np.linalg.inv(cell.T_world_base)
         T_seen_world = np.linalg.inv(cell.T_base_moved) @ T_base_world
@@ -81,7 +84,9 @@ def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
     if mismatch.colours_otherwise:
         numbers = (mismatch.color_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
         colour = ColourSensing(*(np.asarray(n, np.float32) for n in numbers))
-    parts = place, noise, colour
+    if mismatch.resizes:
+        sizes = np.asarray(cell.seen_size[:TARGET], np.float32)
+    parts = place, noise, colour, sizes
     return None if all(part is None for part in parts) else Sensing(*parts)
 
 
@@ -99,6 +104,25 @@ def true_camera(camera: Camera, sensing: Sensing | None) -> Camera:
 def as_seen(bodies: Bodies, sensing: Sensing | None) -> Bodies:
     """Bodies where they seem to be to the planner."""
     return bodies if sensing is None or sensing.place is None else _moved(bodies, sensing.place.T_seen_world)
+
+
+def resized(objects: Superquadrics, sensing: Sensing | None) -> Superquadrics:
+    """Objects as large as they seem to be, each with its lowest point as low as before.
+
+    An approximation: a body of several parts keeps its proportions, and has the mean of its factors.
+    """
+    if sensing is None or sensing.sizes is None:
+        return objects
+    factors = jnp.asarray(sensing.sizes)
+    parts = objects.parts
+    if parts is not None:
+        factors = jnp.broadcast_to(jnp.exp(jnp.mean(jnp.log(factors), axis=-1, keepdims=True)), factors.shape)
+        scale = factors[:, None]
+        parts = parts.replace(size=parts.size * scale, position=parts.position * scale)
+    larger = objects.replace(size=objects.size * factors, parts=parts)
+    down = jnp.array([[0.0], [0.0], [1.0]])
+    lower = extents(larger, down) - extents(objects, down)
+    return larger.replace(position=larger.position + lower * down.T)
 
 
 def in_base(bodies: Bodies, sensing: Sensing | None) -> Bodies:

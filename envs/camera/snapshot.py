@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, true_camera
+from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, resized, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window, window_of
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -202,7 +202,7 @@ def informed(key: Array, snapshot: Snapshot) -> Observation:
 
 
 def _seen_objects(snapshot: Snapshot) -> Superquadrics:
-    """The true objects on the board, where they seem to be to the planner.
+    """The true objects on the board, where they seem to be to the planner, and as large.
 
     Raises:
       InputError: depth or colour are measured otherwise, which without an image would change nothing.
@@ -211,7 +211,7 @@ def _seen_objects(snapshot: Snapshot) -> Superquadrics:
         raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
     if snapshot.sensing is not None and snapshot.sensing.colour is not None:
         raise InputError("color_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
-    return as_seen(objects_on_the_board(snapshot), snapshot.sensing)
+    return as_seen(resized(objects_on_the_board(snapshot), snapshot.sensing), snapshot.sensing)
 
 
 def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:

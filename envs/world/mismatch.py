@@ -48,6 +48,8 @@ class Mismatch:
       mass: factor on the masses and inertias of all bodies on the shelf.
       friction_spread, mass_spread: each body's sliding friction, and its mass and inertia, are multiplied by a further
         factor of its own, between 1 / spread and spread; its logarithm is uniformly distributed. 1: none.
+      size_spread: the same of the width, depth and height with which each object is recognised where true shapes are;
+        its lowest point stays.
       physics: contacts and time step of the simulation, one of `simulators.physics.PHYSICS`.
       arm_stop: an arm with a joint farther than this from its reference stops and goes back the way it came [rad]; 0:
         it goes on, as trials take it to. Ordinary actions reach 0.027.
@@ -69,6 +71,9 @@ class Mismatch:
         1.0, "each body's friction is drawn between this many times less and more than it would be"
     )
     mass_spread: float = option(1.0, "each body's mass is drawn between this many times less and more than it would be")
+    size_spread: float = option(
+        1.0, "each true width, depth and height is recognised between this many times smaller and larger than it is"
+    )
     physics: PhysicsName = option("usual", "contacts and time step of the simulated world", get_args(PhysicsName))
     arm_stop: float = option(
         0.0, "joint error at which the simulated arm stops and goes back [rad]; 0.03 or more; 0: never"
@@ -90,6 +95,7 @@ class Mismatch:
             ("mass", 0.01, 100.0, ""),
             ("friction_spread", 1.0, 10.0, ""),
             ("mass_spread", 1.0, 10.0, ""),
+            ("size_spread", 1.0, 2.0, ""),
             ("arm_stop", 0.0, LARGEST_STOP, "rad"),
             ("camera_shift", 0.0, FARTHEST, "m"),
             ("camera_turn", 0.0, STEEPEST, "degrees"),
@@ -119,6 +125,11 @@ class Mismatch:
         return bool(self.moves_robot or self.camera_shift or self.camera_turn)
 
     @property
+    def resizes(self) -> bool:
+        """Whether objects are recognised larger or smaller than they are."""
+        return self.size_spread > 1.0
+
+    @property
     def measures_otherwise(self) -> bool:
         """Whether measured depth differs from the usual."""
         return self.depth_noise != USUAL_NOISE or self.missing_depth > 0.0
@@ -138,7 +149,7 @@ class Mismatch:
 
     def mould(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
-        return self.moves_camera, self.measures_otherwise, self.colours_otherwise
+        return self.moves_camera, self.resizes, self.measures_otherwise, self.colours_otherwise
 
     def check(self, recognition: str, engine: str) -> None:
         """Check that episodes with a recogniser and a simulator, by their names, can have this mismatch.
@@ -148,6 +159,10 @@ class Mismatch:
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
             raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
+        if recognition not in ("oracle", "informed") and self.resizes:
+            raise InputError(
+                "--size-spread: shapes from images are off by themselves; take --recognition oracle or informed"
+            )
         if recognition not in ("full", "full-parts") and self.colours_otherwise:
             raise InputError(
                 "--color-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
@@ -173,6 +188,7 @@ class Mismatch:
         camera_way, camera_axis, shelf_way, shelf_axis = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
         middle = np.array([(shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board])
         friction_share, mass_share = random.uniform(-1.0, 1.0, size=(2, BODIES))
+        size_share = random.uniform(-1.0, 1.0, size=(BODIES, 3))
         # To move robot and camera one way is to move the shelf the other way.
         T_world_base = _motion(-self.shelf_shift * shelf_way, -self.shelf_turn * shelf_axis, middle)
         T_base_moved = _motion(
@@ -187,6 +203,7 @@ class Mismatch:
             self.arm_stop,
             self.friction_spread**friction_share,
             self.mass_spread**mass_share,
+            self.size_spread**size_share,
         )
 
 
@@ -199,6 +216,7 @@ class ActualCell(NamedTuple):
       T_base_moved: what moves the camera, in the base's frame, from where the planner takes it to be to where it is.
       arm_stop: as of `Mismatch`.
       body_friction, body_mass: further factors on the sliding friction, and on mass and inertia, of each body.
+      seen_size: factors on each body's width, depth and height as they are recognised.
     """
 
     friction: float = 1.0
@@ -209,6 +227,7 @@ class ActualCell(NamedTuple):
     arm_stop: float = 0.0
     body_friction: Float[np.ndarray, " 9"] = np.ones(BODIES)
     body_mass: Float[np.ndarray, " 9"] = np.ones(BODIES)
+    seen_size: Float[np.ndarray, "9 3"] = np.ones((BODIES, 3))
 
 
 # As the planner assumes.
@@ -225,6 +244,7 @@ def _motion(shift: np.ndarray, turn: np.ndarray, pivot: np.ndarray) -> Float[np.
 
 
 def _option(field: dataclasses.Field[Any]) -> Option:
+    # `--world-...` is what is simulated, the others what is seen.
     of_world = ("friction", "mass", "friction_spread", "mass_spread", "physics")
     name = f"world_{field.name}" if field.name in of_world else field.name
     choices = field.metadata["choices"]
