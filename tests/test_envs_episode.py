@@ -302,6 +302,16 @@ def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
     assert "retrieval: missed" in narrator.frames[1].caption
 
 
+def test_a_policy_that_compares_no_costs_is_not_said_to(problem):
+    console = Console(record=True, width=200, file=io.StringIO())
+    narrator = Narrator(console, console.status("begins"), problem)
+    run(problem, HIDDEN, Stage(reveal), Method("random").policy(), watcher=narrator)
+    first = console.export_text().split("step 2")[0]
+    assert "the policy compares no costs" in first
+    assert "expected" not in first
+    assert "costs not compared" in narrator.frames[0].caption
+
+
 def test_failed_actions_cost_steps_and_nothing_is_rolled_back(problem):
     stage = Stage(failures=Failure.DROPPED)
     diary = Diary()

@@ -102,6 +102,11 @@ class Step:
     tracking_error: float | None = None
     paper_graspable: bool = False
 
+    @property
+    def compares_costs(self) -> bool:
+        """Whether the policy chose by costs: those of one that does not, such as `random`, are all 0."""
+        return bool(self.cost or self.predicted_cost or self.observed_cost)
+
 
 @dataclasses.dataclass(frozen=True)
 class Episode:

@@ -291,15 +291,14 @@ def depth_of(recording: Recording, step: RecordedStep) -> np.ndarray:
 def costs(recording: Recording, i: int) -> tuple[str, bool] | None:
     """J before a step's action, as expected after it and as observed, and whether it came out as much worse.
 
-    None where that is not recorded, or where the policy minds no cost.
+    None where that is not recorded, or where the policy compares no costs.
     """
     if recording.episode is None or recording.steps[i].action is None:
         return None
     record = recording.episode.steps[i]
     if record.cost is None or record.predicted_cost is None:
         return None
-    if not (record.cost or record.predicted_cost or record.observed_cost):
-        # The policy minds no cost.
+    if not record.compares_costs:
         return None
     observed = "not observed" if record.observed_cost is None else f"{number(record.observed_cost)} observed"
     taken_next = i + 1 < len(recording.steps) and takes_target(recording.steps[i + 1])

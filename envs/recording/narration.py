@@ -68,12 +68,13 @@ class Narrator:
             self._line("why", f"each of the {refused} best does harm as it is tried out" if refused else NOTHING)
         elif record.sequences and record.predicted_cost is not None:
             length = int(moment.decision.sequences.length[0])
-            self._line(
-                "why",
+            why = (
                 f"cost {record.cost:.0f} now, {record.predicted_cost:.0f} expected after it; the best of "
                 f"{record.sequences} sequences, {length} action{'s' if length > 1 else ''} long"
-                + (f", after {refused} that do harm as they are tried out" if refused else ""),
             )
+            if not record.compares_costs:
+                why = f"one of {record.sequences} that are possible; the policy compares no costs"
+            self._line("why", why + (f", after {refused} that do harm as they are tried out" if refused else ""))
 
     def acted(self, moment: Moment) -> None:
         record = moment.record

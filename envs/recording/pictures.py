@@ -43,6 +43,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         if not kind.takes_target:
             expected = "" if record.predicted_cost is None else f" → {record.predicted_cost:.0f} expected"
             why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"
+            why = why if record.compares_costs else f"one of {record.sequences} possible actions, costs not compared"
     believed = bool(belief.found)
     mistaken = "something else is taken for the target" if believed else f"target can be at {record.belief_size} poses"
     target = "target found" if record.found else mistaken
