@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
-from mechsearch_jax.shapes.compound import CONVEX, DIGITS, MOST_SOLIDS, MOST_VERTICES, Piece
+from mechsearch_jax.shapes.compound import CONVEX, DIGITS, MOST_SOLIDS, MOST_VERTICES, Piece, faces, hull
 
 # Largest mesh file [bytes].
 LARGEST_FILE = 1 << 26
@@ -34,25 +36,15 @@ CUT: Mapping[str, Any] = MappingProxyType(
         "mcts_nodes": 10,
     }
 )
+# Thinner walls slip through the simulators' contacts, and through the grid on which grasps are looked for [m].
+LEAST_THICKNESS = 0.002
 # A part of a mesh whose volume is at least this share of its hull's is convex.
 CONVEX_SHARE = 0.98
 
 
-class CutMesh(NamedTuple):
-    """The convex pieces of a mesh.
-
-    Attributes:
-      pieces: in the mesh's frame.
-      open_edges: number of the surface's edges at which it ends; 0 of a closed one.
-    """
-
-    pieces: tuple[Piece, ...]
-    open_edges: int
-
-
 @functools.lru_cache(maxsize=64)
-def _read(path: Path, content: str, scale: float, where: str) -> CutMesh:
-    """`cut_mesh` of a file with a digest of its content."""
+def _read(path: Path, content: str, scale: float, where: str) -> tuple[Piece, ...]:
+    """`convex_pieces` of a file with a digest of its content."""
     loaded = _surface(path, where)
     loaded.apply_scale(scale)
     if not np.isfinite(loaded.vertices).all():
@@ -65,7 +57,49 @@ def _read(path: Path, content: str, scale: float, where: str) -> CutMesh:
         rows = kept_arrays("mesh", key, lambda: _decomposed(loaded, path, where))
         hulls = [rows[name] for name in sorted(rows)]
     uses = np.unique(loaded.edges_sorted, axis=0, return_counts=True)[1]
-    return CutMesh(tuple(_piece(vertices, path, where) for vertices in hulls), int((uses == 1).sum()))
+    pieces = [_piece(vertices, path, where) for vertices in hulls]
+    _note_what_was_mended(path, int((uses == 1).sum()), pieces)
+    return tuple(_thickened(piece) for piece in pieces)
+
+
+def _note_what_was_mended(path: Path, open_edges: int, pieces: Sequence[Piece]) -> None:
+    if open_edges:
+        volume = 1e6 * sum(float(hull(piece).volume) for piece in pieces)
+        warnings.warn(
+            f"{path}: its surface is not closed ({open_edges} open edges), so that what is inside is a guess; it is"
+            f" taken as {len(pieces)} convex pieces of {volume:.0f} cm3 together; close it if pictures show them wrong",
+            Note,
+            stacklevel=2,
+        )
+    thin = [width for piece in pieces if (width := thickness(piece)[0]) < LEAST_THICKNESS]
+    if thin:
+        warnings.warn(
+            f"{path}: {len(thin)} of its convex pieces are thinner than {1e3 * LEAST_THICKNESS:g} mm (the thinnest"
+            f" {1e3 * min(thin):.2g} mm) and are made so thick; if that is not meant, scale is that of another unit",
+            Note,
+            stacklevel=2,
+        )
+
+
+def thickness(piece: Piece) -> tuple[float, Float[np.ndarray, " 3"]]:
+    """The least distance between parallel planes that touch a polyhedron, one of which holds a face [m]; their normal
+    in the piece's frame."""
+    normals = faces(piece)[:, :3]
+    along = np.array(piece.vertices) @ normals.T
+    widths = np.ptp(along, axis=0)
+    least = int(np.argmin(widths))
+    return float(widths[least]), normals[least]
+
+
+def _thickened(piece: Piece) -> Piece:
+    """The polyhedron, stretched to at least `LEAST_THICKNESS` along its shortest width."""
+    width, normal = thickness(piece)
+    if width >= LEAST_THICKNESS:
+        return piece
+    corners = np.array(piece.vertices)
+    grown = corners + (LEAST_THICKNESS / max(width, 1e-6) - 1.0) * (corners @ normal)[:, None] * normal
+    rows = np.round(grown, DIGITS).tolist()
+    return dataclasses.replace(piece, vertices=tuple((x, y, z) for x, y, z in rows))
 
 
 def _surface(path: Path, where: str):
@@ -138,11 +172,12 @@ def thinned(corners: Float[np.ndarray, "n 3"], most: int = MOST_VERTICES) -> Flo
     return corners[np.unique(np.argmax(corners @ directions.T, axis=0))]
 
 
-def cut_mesh(path: Path, scale: float, where: str) -> CutMesh:
-    """The convex pieces of a mesh file.
+def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
+    """The convex pieces of a mesh file, in the mesh's frame.
 
     A mesh of at most 16 connected parts that are convex is taken as it is. Any other is cut into at most `PIECES`
-    pieces, always the same, which are kept on disk, see `runtime.kept_arrays`.
+    pieces, always the same, which are kept on disk, see `runtime.kept_arrays`. A `Note` warns where the surface is not
+    closed, and where pieces are thinner than `LEAST_THICKNESS` and are made so thick.
 
     Args:
       path: of the file.
@@ -161,8 +196,3 @@ def cut_mesh(path: Path, scale: float, where: str) -> CutMesh:
             f"{where}: {path} cannot be read ({error.strerror}); a path in a file counts from that file's folder"
         ) from None
     return _read(path, content, scale, where)
-
-
-def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
-    """The pieces of `cut_mesh`."""
-    return cut_mesh(path, scale, where).pieces

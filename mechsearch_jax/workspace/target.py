@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.runtime.identity import Uncompared
 from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
+from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents
+from mechsearch_jax.shapes.meshes import LEAST_THICKNESS, thickness
 from mechsearch_jax.shapes.solid import Solid, Union, Whole
 from mechsearch_jax.workspace.compound_file import format_compound, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
@@ -47,7 +48,7 @@ class Target:
       shape: name of its shape; "compound" of a target of several pieces.
       half_size: half-extents [m]; of a compound those of the smallest box about its centre of mass.
       grid: number of candidate positions in x and y.
-      inset: distance between the outermost candidate positions and the board's edges [m].
+      inset: distance between the outermost candidate positions and the board's edges [m]; see `margin`.
       yaws: number of candidate yaw angles over a `turn`; 1 for a round target.
       compound: what a target of several pieces is made of, in the frame of its centre of mass; None for any other.
       traced: its geometry, inside of a program; not for use elsewhere.
@@ -130,7 +131,7 @@ class Target:
         """A target of the shape of a mesh file (OBJ, STL or PLY), which stands upright in its frame, z up.
 
         Args:
-          path: of the file; see `shapes.meshes.cut_mesh`.
+          path: of the file; see `shapes.meshes.convex_pieces`.
           scale: metres per unit of the file.
           density, friction: as of `from_parts`.
 
@@ -162,8 +163,14 @@ class Target:
         """The target that a compound is, which stands upright in its frame, z up.
 
         Raises:
-          InputError: it is too large.
+          InputError: it is too large, or a polyhedron is too thin.
         """
+        thin = min((thickness(piece)[0] for piece in compound.pieces if piece.shape == CONVEX), default=1.0)
+        if thin < 0.99 * LEAST_THICKNESS:
+            raise InputError(
+                f"Target: a piece is {1e3 * thin:.2g} mm thick; make it at least {1e3 * LEAST_THICKNESS:g} mm thick, or"
+                " give a mesh, whose pieces are made so"
+            )
         # Its colour is the detector's, whatever the compound's own.
         compound = dataclasses.replace(centred(compound)[0], colour=None)
         return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
@@ -248,16 +255,28 @@ class Target:
         """Its height [m]."""
         return self.bottom + self.top
 
+    @property
+    def margin(self) -> float:
+        """Distance between the outermost candidate positions and the board's edges [m]: the inset, or the radius of a
+        target that would be in a wall there at some yaw."""
+        return max(self.inset, math.ceil(1e3 * self.solid.radius - 1e-6) / 1e3)
+
     def height(self, shelf: Shelf) -> float | Array:
         """z of the centre of a target that stands on the board [m]; the shelf may be traced."""
         return shelf.board + self.bottom
 
     def check_fits(self, shelf: Shelf) -> None:
-        """Check that it is lower than the shelf.
+        """Check that it is lower than the shelf, and narrower than its board.
 
         Raises:
           InputError: it is not.
         """
+        deep, wide = float(shelf.back - shelf.front), float(shelf.left - shelf.right)
+        if not 2 * self.margin < min(deep, wide):
+            raise InputError(
+                f"Target: it reaches {self.solid.radius:.3f} m from its middle, too far for a board of {deep:g} m x"
+                f" {wide:g} m; use a smaller one, or write its scale, if it is in another unit"
+            )
         room = float(shelf.ceiling - shelf.board)
         if self.tall > room:
             raise InputError(
@@ -267,10 +286,10 @@ class Target:
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
         """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.
 
-        The outermost positions are `inset` from the board's edges; the default spacing is 15 to 16 mm.
+        The outermost positions are `margin` from the board's edges; the default spacing is 15 to 16 mm.
         """
-        x = np.linspace(shelf.front + self.inset, shelf.back - self.inset, self.grid[0])
-        y = np.linspace(shelf.right + self.inset, shelf.left - self.inset, self.grid[1])
+        x = np.linspace(shelf.front + self.margin, shelf.back - self.margin, self.grid[0])
+        y = np.linspace(shelf.right + self.margin, shelf.left - self.margin, self.grid[1])
         yaw = np.arange(self.yaws) * self.turn / self.yaws
         return np.stack(np.meshgrid(x, y, yaw, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
 
@@ -286,7 +305,7 @@ class Target:
         """
         poses = self.candidate_poses(shelf)
         offsets = np.tile(shares * np.array(self.cell(shelf), np.float32) / 2, (len(poses), 1, 1))
-        outward = max(self.inset - self.solid.breadth, 0.0)
+        outward = max(self.margin - self.solid.breadth, 0.0)
         for axis, side in ((0, 1.0), (1, 1.0), (1, -1.0)):
             outermost = poses[:, axis] * side == np.max(poses[:, axis] * side)
             offsets[np.ix_(outermost, shares[:, axis] == side, [axis])] = side * outward
@@ -295,8 +314,8 @@ class Target:
     def cell(self, shelf: Shelf) -> tuple[float, float, float]:
         """Spacing of the candidate poses in x, y [m] and yaw [rad]."""
         return (
-            (shelf.back - shelf.front - 2 * self.inset) / (self.grid[0] - 1),
-            (shelf.left - shelf.right - 2 * self.inset) / (self.grid[1] - 1),
+            (shelf.back - shelf.front - 2 * self.margin) / (self.grid[0] - 1),
+            (shelf.left - shelf.right - 2 * self.margin) / (self.grid[1] - 1),
             self.turn / self.yaws if self.yaws > 1 else 0.0,
         )
 

@@ -27,7 +27,7 @@ def load_target(path: PathLike, scale: float = 1.0) -> Target:
     `scale`, and no place; `quaternion` turns it upright, z up, if it is not already. Any other file is a mesh, z up.
 
     Args:
-      path: of the file. For meshes see `meshes.cut_mesh`.
+      path: of the file. For meshes see `meshes.convex_pieces`.
       scale: metres per unit of a mesh; in a JSON file that is a key.
 
     Raises:
