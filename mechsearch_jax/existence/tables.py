@@ -88,15 +88,15 @@ def _views_of_pieces(
     around: tuple[int, int],
 ) -> tuple[render.Window, Int[np.ndarray, "x s 2"]]:
     """`_views` of a target of pieces, for which the faces of all pieces are tested at every pixel."""
-    side = next((side for side in SIDES if side >= max(window)), max(window))
+    rows, columns = (next((side for side in SIDES if side >= least), least) for least in window)
     T = np.asarray(T_world_target).reshape(-1, 4, 4)
     # Neighbouring cells have their corners in common.
     _, index, inverse = np.unique(
         np.round(T[:, :3], 5).reshape(len(T), -1), axis=0, return_index=True, return_inverse=True
     )
-    rows = len(index) + -len(index) % ROWS
-    once = T[np.pad(index, (0, rows - len(index)), mode="edge")]
-    views, first = jax.device_get(_views_in_blocks(coarse, target, once, np.float32(around), (side, side)))
+    missing = -len(index) % ROWS
+    once = T[np.pad(index, (0, missing), mode="edge")]
+    views, first = jax.device_get(_views_in_blocks(coarse, target, once, np.float32(around), (rows, columns)))
     shape = T_world_target.shape[:2]
     return jax.tree.map(lambda a: a[inverse].reshape(*shape, *a.shape[1:]), (views, first))
 

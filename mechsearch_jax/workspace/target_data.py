@@ -73,10 +73,12 @@ class TargetData(flax.struct.PyTreeNode):
         if self.planes.shape[-2] == 0:
             return first
 
+        planes, last = jnp.asarray(self.planes), jnp.asarray(self.last)
+
         def of_plane(i, state):
             near, far, first = state
-            near, far = union.crossed(self.planes[i, :3], self.planes[i, 3], origin, direction, (near, far), jnp)
-            ends = self.last[i]
+            near, far = union.crossed(planes[i, :3], planes[i, 3], origin, direction, (near, far), jnp)
+            ends = last[i]
             first = jnp.where(ends, jnp.minimum(first, union.entry(near, far, jnp)), first)
             return jnp.where(ends, jnp.inf, near), jnp.where(ends, 0.0, far), first
 
