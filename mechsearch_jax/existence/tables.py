@@ -96,7 +96,9 @@ def _views_of_pieces(
     )
     missing = -len(index) % ROWS
     once = T[np.pad(index, (0, missing), mode="edge")]
-    views, first = jax.device_get(_views_in_blocks(coarse, target, once, np.float32(around), (rows, columns)))
+    views, first = jax.device_get(
+        _views_in_blocks(coarse, target, once, np.asarray(around, np.float32), (rows, columns))
+    )
     shape = T_world_target.shape[:2]
     return jax.tree.map(lambda a: a[inverse].reshape(*shape, *a.shape[1:]), (views, first))
 

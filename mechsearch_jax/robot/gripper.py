@@ -23,7 +23,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.cloud import cloud_of
+from mechsearch_jax.robot.cloud import Solid, cloud_of
 from mechsearch_jax.robot.kinematics import Numbers
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf
@@ -255,7 +255,8 @@ def _sampled(
     gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
     """`swept_cloud` of checked arguments; cached, because several tables of a problem need the same clouds."""
-    solids = [(p.kind, p.size, p.T_frame_primitive.tobytes()) for p in primitives_in_gripper(gripper, opening, q7)]
+    primitives = primitives_in_gripper(gripper, opening, q7)
+    solids: list[Solid] = [(p.kind, p.size, p.T_frame_primitive.tobytes()) for p in primitives]
     return cloud_of(tuple(solids), gripper.front, FINE, count, distance, seed)
 
 

@@ -174,7 +174,8 @@ def _entered(rows: Polyhedra, offset: np.ndarray, origin: Sequence[Any], directi
         return library.full(shape, value, direction[0].dtype)
 
     def of_face(state, face):
-        return crossed(*face, origin, direction, state, library)
+        normal, offset = face
+        return crossed(normal, offset, origin, direction, state, library)
 
     def of_polyhedron(first, faces):
         near, far = _fold(of_face, (full(library.inf), full(0.0)), faces, library)

@@ -12,6 +12,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from mechsearch_jax.shapes import union
@@ -58,8 +59,8 @@ class TargetData(flax.struct.PyTreeNode):
 
     def is_of(self, compound: Compound | None) -> bool:
         """Whether these are the arrays of a compound; False inside of a program."""
-        number, tracer = self.number, jax.core.Tracer
-        if not isinstance(number, np.ndarray | np.generic | jax.Array) or isinstance(number, tracer):
+        number = self.number
+        if not isinstance(number, np.ndarray | np.generic | jax.Array) or isinstance(number, Tracer):
             return False
         return np.ndim(number) == 0 and compound is not None and int(number) == _number(compound)
 

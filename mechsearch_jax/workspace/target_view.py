@@ -44,7 +44,8 @@ def body_at(
         return jnp.asarray(np.broadcast_to(row, (*valid.shape, *row.shape)))
 
     if target.is_compound:
-        parts = Superquadrics(*(constant(row) for row in target.data.parts))
+        rows: Any = (constant(row) for row in target.data.parts)
+        parts = Superquadrics(*rows)
     return Superquadrics(
         size=constant(_half_size(target)),
         exponents=constant(np.array(target.exponents, np.float32)),
