@@ -9,6 +9,7 @@ nowhere on its straight way in.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Sequence
 
@@ -85,14 +86,13 @@ def closings(
       tilts: angles by which the gripper points down [rad].
       height: usual height above the centre of mass [m].
     """
-    field = field_of(compound)
     body = surface(compound, BODY_POINTS)
     if yaws is not None:
         angles = list(yaws)[:: math.ceil(len(yaws) / MOST)]
-        single = _chosen(_lines(field, gripper, [0.0], height), gripper, body, tilts, max(MOST // len(angles), 1))
+        single = _chosen(_lines(compound, gripper, (0.0,), height), gripper, body, tilts, max(MOST // len(angles), 1))
         return _turned(single, angles)
-    angles = [2 * math.pi * i / DIRECTIONS for i in range(DIRECTIONS)]
-    return _chosen(_lines(field, gripper, angles, height), gripper, body, tilts, MOST)
+    angles = tuple(2 * math.pi * i / DIRECTIONS for i in range(DIRECTIONS))
+    return _chosen(_lines(compound, gripper, angles, height), gripper, body, tilts, MOST)
 
 
 def _turned(single: Closings, angles: Sequence[float]) -> Closings:
@@ -105,13 +105,15 @@ def _turned(single: Closings, angles: Sequence[float]) -> Closings:
     )
 
 
-def _lines(field: Field, gripper: Gripper, angles: Sequence[float], height: float) -> list[_Line]:
+@functools.lru_cache(maxsize=16)
+def _lines(compound: Compound, gripper: Gripper, angles: tuple[float, ...], height: float) -> tuple[_Line, ...]:
     """All candidates, the best first."""
+    field = field_of(compound)
     low, high = _ends(field)
     heights = np.linspace(low + FROM_ENDS, max(high - FROM_ENDS, low + FROM_ENDS), HEIGHTS)
     usual = min(height, 0.6 * high)
     found = [line for yaw in angles for z in (*heights, usual) for line in _at_height(field, gripper, yaw, z, usual)]
-    return sorted(found, key=lambda line: -line.score)
+    return tuple(sorted(found, key=lambda line: -line.score))
 
 
 def _ends(field: Field) -> tuple[float, float]:
@@ -200,7 +202,7 @@ def _closing(field: Field, gripper: Gripper, yaw: float, point: np.ndarray, usua
 
 
 def _chosen(
-    lines: list[_Line], gripper: Gripper, body: Float[np.ndarray, "n 3"], tilts: Sequence[float], most: int
+    lines: Sequence[_Line], gripper: Gripper, body: Float[np.ndarray, "n 3"], tilts: Sequence[float], most: int
 ) -> Closings:
     """The best lines that differ, and that the open gripper reaches at some tilt; every direction has its turn."""
     chosen: list[_Line] = []

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.compound_grasps import closings
+from mechsearch_jax.candidate_pairs import PIECES_PAIRS, ROUND_PAIRS, filled_up, pair_tables
+from mechsearch_jax.compound_grasps import MOST, closings
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
@@ -44,8 +45,6 @@ COARSE = 256
 # Number of hits that a pose without a feasible grasp counts for: one more than the eight objects of a scene and its
 # target, for any number of slots.
 INFEASIBLE = 10
-# The numbers of feasible pairs in all, and at a pose, are rounded up to multiples of these.
-PAIRS_STEP, POSE_STEP = 1024, 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,6 +220,9 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
       InputError: the target is too wide for the gripper.
     """
     T_target_gripper, wrist = _target_grasps(target, gripper, config)
+    count = len(wrist)
+    if target.is_compound:
+        T_target_gripper, wrist = filled_up(T_target_gripper, wrist, MOST * len(config.tilts) * len(config.wrists))
     angles = [WRIST_ORIGIN + a for a in config.wrists]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]
@@ -235,12 +237,14 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
         key: swept_target(target, direction, gripper.approach, config.target_points, config.erosion)
         for key, direction in directions.items()
     }
-    for T, w, direction in zip(np.asarray(T_target_gripper), wrist, outward, strict=True):
+    for T, w, direction in list(zip(np.asarray(T_target_gripper), wrist, outward, strict=True))[:count]:
         inside = (swept_targets[direction.tobytes()] - T[:3, 3]) @ T[:3, :3]
         both = np.concatenate([swept[w], inside])
         clouds.append(both[order].T)
         low.append(both.min(axis=0))
         high.append(both.max(axis=0))
+    for rows in (clouds, low, high):
+        rows += [rows[-1]] * (len(wrist) - count)
     still_target = swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion)
     fields = {
         "T_target_gripper": T_target_gripper,
@@ -251,7 +255,7 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
         "high": np.float32(np.stack(high)),
         "still_gripper": np.float32(np.stack([cloud.T for cloud in still])),
         "still_target": np.float32(still_target.T),
-        "gap": np.float32(max(gap_of(cloud.T, COARSE) for cloud in clouds)),
+        "gap": np.float32(max(gap_of(cloud.T, COARSE) for cloud in clouds[:count])),
     }
     return GraspTables(**jax.device_put(fields))
 
@@ -265,25 +269,10 @@ def candidate_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: Gra
     tables = grasp_tables(gripper, target, config)
     poses = np.asarray(jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf)))
     feasible = jax.jit(lambda tables, shelf, poses: feasible_grasps(tables, shelf, gripper, config, poses))
-    pose, grasp = np.nonzero(np.asarray(feasible(tables, shelf, jax.device_put(poses))))
-    fields = {"T_world_target": poses, **_padded_pairs(pose, grasp, len(poses))}
+    able = np.asarray(feasible(tables, shelf, jax.device_put(poses)))
+    most = None if not target.is_compound else ROUND_PAIRS if target.round else PIECES_PAIRS
+    fields = {"T_world_target": poses, **pair_tables(able, most)}
     return CandidateGrasps(**vars(tables), **jax.device_put(fields))
-
-
-def _padded_pairs(pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int) -> dict[str, Any]:
-    """The fields of `CandidateGrasps` for the feasible pairs of a candidate pose and a grasp."""
-    rows = len(pose) + -len(pose) % PAIRS_STEP
-    count = np.bincount(pose, minlength=poses)
-    place = np.arange(len(pose)) - np.repeat(np.cumsum(count) - count, count)
-    width = int(count.max(initial=0))
-    pose_pairs = np.full((poses, width + -width % POSE_STEP), rows, np.int32)
-    pose_pairs[pose, place] = np.arange(len(pose))
-    return {
-        "pair_pose": np.int32(np.pad(pose, (0, rows - len(pose)), mode="edge") if rows else pose),
-        "pair_grasp": np.int32(np.pad(grasp, (0, rows - len(pose)), mode="edge") if rows else grasp),
-        "pair_valid": np.arange(rows) < len(pose),
-        "pose_pairs": pose_pairs,
-    }
 
 
 class Pairs(NamedTuple):

@@ -59,13 +59,14 @@ class TargetGrasps(flax.struct.PyTreeNode):
     Attributes:
       tables: constants of the grasps.
       shelf: data.
-      gripper, target, config: static.
+      target: as of a `Problem`.
+      gripper, config: static.
     """
 
     tables: GraspTables
     shelf: Shelf
     gripper: Gripper = flax.struct.field(pytree_node=False)
-    target: Target = flax.struct.field(pytree_node=False)
+    target: Target
     config: GraspConfig = flax.struct.field(pytree_node=False)
 
 

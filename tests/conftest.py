@@ -166,7 +166,8 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture(scope="session")
 def problem():
     """The default problem: the paper's shelf, camera and gripper, and the cylinder as the target."""
-    from mechsearch_jax.problem.cache import VARIABLE, cached_problem
+    from mechsearch_jax.problem.cache import cached_problem
+    from mechsearch_jax.runtime.kept_arrays import VARIABLE
 
     # It is built once for all processes, and the same for all files.
     before = jax.config.read("jax_disable_most_optimizations")

@@ -5,7 +5,7 @@ import pytest
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import options
 from mechsearch_jax.envs.scenes import scene_sets
-from mechsearch_jax.problem import cache
+from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario, example_scenarios, load_scenario, save_scenario
 
@@ -18,7 +18,7 @@ def folder(tmp_path, monkeypatch):
     """An empty folder to be in, a cache of its own, and a set of three scenes that take no time."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "cache"))
     few = scene_sets.Block("d1", 3, 2, "cylinder", BLOCK.first_seed, "line")
     three = scene_sets.SceneSet("three", "three scenes", (few,))
     monkeypatch.setattr(scene_sets, "SETS", {**scene_sets.SETS, "three": three})

@@ -90,6 +90,8 @@ def test_grasps_close_on_material_and_reach_it_free(target):
     gripper, config = Gripper(), GraspConfig()
     tables = grasp_tables(gripper, target, config)
     T = np.asarray(tables.T_target_gripper, float)
+    # The other rows hold no grasp.
+    T = T[T[:, 2, 3] > -1.0]
     assert 20 <= len(T) <= 4 * 4 * len(config.tilts) * len(config.wrists)
     field = field_of(target.compound)
     body = surface(target.compound, 1500)

@@ -15,6 +15,7 @@ from mechsearch_jax.problem import cache
 from mechsearch_jax.problem.problem import NOWHERE
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
@@ -60,21 +61,21 @@ def test_the_weights_are_listed_with_their_digests(monkeypatch):
 
 def test_the_caches_are_measured(tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path))
     (tmp_path / "file").write_bytes(bytes(2_000_000))
     (whole,) = findings_of("cache")
     assert whole.says.endswith(f"{tmp_path}, 1 files, 2 MB, writable")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "file"))
     (broken,) = findings_of("cache")
-    assert (broken.state, cache.VARIABLE in broken.remedy) == (State.MISSING, True)
-    monkeypatch.setenv(cache.VARIABLE, "")
+    assert (broken.state, kept_arrays.VARIABLE in broken.remedy) == (State.MISSING, True)
+    monkeypatch.setenv(kept_arrays.VARIABLE, "")
     assert "every start takes minutes" in findings_of("cache")[0].says
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     assert [finding.says.split(":")[0] for finding in findings_of("cache")] == ["problems are not kept", "compilations"]
 
 
 def test_a_problem_is_looked_for_in_the_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path))
     assert findings_of("problem")[0].state is State.MISSING
     key = cache._key(cache._parts(target_of(SCENE), None, None, None, None))
     cache._file(tmp_path, key).touch()
@@ -128,7 +129,7 @@ def test_a_cell_that_works_less_well_is_doubtful(problem, monkeypatch):
 def test_doctor_looks_at_the_cell_that_is_given(problem, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(health, "CHECKS", {})
     monkeypatch.setattr(Workcell, "problem", lambda self, target=None, config=None: problem)
-    monkeypatch.setenv(cache.VARIABLE, "")
+    monkeypatch.setenv(kept_arrays.VARIABLE, "")
     file = tmp_path / "mine.toml"
     file.write_text("[shelf]\nfront = 1.414\nback = 1.788\nspawn_x = [1.45, 1.73]\n")
     cli.parse(["doctor", "--config", str(file)])()

@@ -14,8 +14,8 @@ from mechsearch_jax.envs.scenes.generator import GeneratorConfig, outline, separ
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
 from mechsearch_jax.envs.scenes.three_objects import LineConfig, LineGenerator
 from mechsearch_jax.envs.world import world
-from mechsearch_jax.problem import cache
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
@@ -182,7 +182,7 @@ def quick(monkeypatch):
 
 def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, quick):
     block, made, record = quick
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "cache"))
     progressed = []
 
     def progress(missing):
@@ -218,7 +218,7 @@ def test_scenes_that_are_not_what_is_on_record_are_reported(tmp_path, quick):
 
 def test_without_a_cache_files_are_there_while_the_process_is(monkeypatch, quick):
     block, made, _ = quick
-    monkeypatch.setenv(cache.VARIABLE, "")
+    monkeypatch.setenv(kept_arrays.VARIABLE, "")
     (file,) = scene_files([(block, 3)]).files
     assert load_scenario(file).name == "quick-003"
     assert scene_files([(block, 3)]).files == [file]

@@ -7,12 +7,13 @@ import pytest
 from mechsearch_jax.config.presets import paper
 from mechsearch_jax.problem import cache
 from mechsearch_jax.problem import problem as problems
+from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.workspace.target import Target
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
@@ -68,10 +69,10 @@ def test_a_damaged_file_is_built_anew(folder, problem, monkeypatch, damage):
 
 def test_without_a_folder_problems_are_built(tmp_path, problem, monkeypatch):
     monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
-    monkeypatch.setenv(cache.VARIABLE, "")
+    monkeypatch.setenv(kept_arrays.VARIABLE, "")
     assert cache.cached_problem() is problem
     (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "file"))
     assert cache.cached_problem() is problem
 
 
@@ -80,4 +81,4 @@ def test_only_a_few_problems_are_kept(folder, problem, monkeypatch):
     for version in range(cache.CACHED_PROBLEMS + 2):
         monkeypatch.setattr(cache, "_source", lambda version=version: str(version))
         cache.cached_problem()
-    assert len(list(folder.iterdir())) == cache.CACHED_PROBLEMS
+    assert len(list(folder.glob("problem-*"))) == cache.CACHED_PROBLEMS

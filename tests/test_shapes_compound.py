@@ -1,14 +1,16 @@
 """Primitives against references in float64, and compounds: solids, mass properties, superquadric parts, and meshes."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import PRIMITIVES, frustum
+from mechsearch_jax.runtime import kept_arrays
+from mechsearch_jax.runtime.errors import InputError, Note
+from mechsearch_jax.shapes import PRIMITIVES, frustum, meshes
 from mechsearch_jax.shapes import compound as compounds
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
 from mechsearch_jax.shapes.meshes import convex_pieces, thinned
@@ -218,6 +220,59 @@ def test_what_no_mesh_is_is_one_line(tmp_path, monkeypatch):
             convex_pieces(tmp_path / name, 1.0, "scene.json: objects[0].mesh")
         assert str(error.value).startswith("scene.json: objects[0].mesh: ")
         assert "\n" not in str(error.value)
+
+
+def test_a_mesh_is_cut_once_and_again_if_what_was_kept_is_damaged(tmp_path, monkeypatch):
+    pytest.importorskip("coacd")
+    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "cache"))
+    cuts = []
+    decomposed = meshes._decomposed
+    monkeypatch.setattr(meshes, "_decomposed", lambda *args: cuts.append(args) or decomposed(*args))
+    trimesh.creation.annulus(0.03, 0.04, 0.05).export(tmp_path / "ring.stl")
+
+    def cut(scale=1.0):
+        meshes._read.cache_clear()
+        return convex_pieces(tmp_path / "ring.stl", scale, "here")
+
+    first = cut()
+    assert cut() == first
+    assert len(cuts) == 1
+    (file,) = (tmp_path / "cache").glob("mesh-*.npz")
+    file.write_bytes(file.read_bytes()[:100])
+    assert cut() == first
+    assert len(cuts) == 2
+    cut(2.0)
+    assert len(cuts) == 3
+    # Another content counts, not another time.
+    trimesh.creation.annulus(0.03, 0.04, 0.06).export(tmp_path / "ring.stl")
+    assert cut() != first
+    monkeypatch.setenv(kept_arrays.VARIABLE, "")
+    cut()
+    assert len(cuts) == 5
+
+
+def test_vertices_that_a_file_has_several_times_do_not_open_a_surface(tmp_path):
+    box = trimesh.creation.box((0.02, 0.03, 0.04))
+    box.unmerge_vertices()
+    (tmp_path / "seams.obj").write_text(trimesh.exchange.obj.export_obj(box))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(convex_pieces(tmp_path / "seams.obj", 1.0, "here")) == 1
+
+
+def test_what_is_not_closed_or_too_thin_is_used_and_said_in_one_line(tmp_path):
+    pytest.importorskip("coacd")
+    box = trimesh.creation.box((0.04, 0.06, 0.08))
+    box.update_faces(np.arange(len(box.faces)) > 1)
+    box.export(tmp_path / "open.stl")
+    trimesh.creation.box((0.05, 0.0004, 0.06)).export(tmp_path / "sheet.stl")
+    for name, said in (("open.stl", r"not closed \(4 open edges\)"), ("sheet.stl", r"thinner than 2 mm .*0\.4 mm")):
+        with pytest.warns(Note, match=said) as notes:
+            pieces = convex_pieces(tmp_path / name, 1.0, "here")
+        assert all("\n" not in str(note.message) for note in notes)
+        assert min(meshes.thickness(piece)[0] for piece in pieces) > 0.0019
+    (sheet,) = pieces
+    np.testing.assert_allclose(np.ptp(np.array(sheet.vertices), axis=0), (0.05, 0.002, 0.06), atol=1e-6)
 
 
 def test_few_corners_are_left_of_many():

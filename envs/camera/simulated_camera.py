@@ -22,7 +22,7 @@ from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, Targe
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
-from mechsearch_jax.shapes.compound import MOST_SOLIDS, half_extents
+from mechsearch_jax.shapes.compound import MOST_SOLIDS
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -248,7 +248,7 @@ def target_window(camera: Camera, half_size: Sequence[float] = USUAL_HALF_SIZE) 
 def window_of(camera: Camera, world: World) -> int:
     """`target_window` of the target in a world; the usual one's if it is no compound."""
     if isinstance(world, TargetCompoundWorld):
-        return target_window(camera, half_extents(world.target))
+        return target_window(camera, world.room)
     return target_window(camera)
 
 

@@ -171,8 +171,8 @@ def _weights() -> Iterator[Finding]:
 
 
 def _cache() -> Iterator[Finding]:
-    from mechsearch_jax.problem.cache import VARIABLE, cache_folder
     from mechsearch_jax.runtime.files import check_writable
+    from mechsearch_jax.runtime.kept_arrays import VARIABLE, cache_folder
 
     folders = {"problems, compilations": cache_folder()}
     if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):

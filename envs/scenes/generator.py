@@ -228,7 +228,9 @@ class ScenarioGenerator:
             hidden = scene and self._hide(rng, scene)
             if hidden:
                 return hidden
-        raise InputError(f"{name}: no graspable place is hidden in {self.config.attempts} scenes; try another seed")
+        raise InputError(
+            f"{name}: no graspable place is hidden in {self.config.attempts} scenes; try another seed, or more objects"
+        )
 
     def _drop(self, rng: np.random.Generator, objects: int, name: str) -> Scenario | None:
         """Objects at rest on the board, and the target wherever it does not touch them."""

@@ -266,7 +266,7 @@ def holds(file: PathLike, block: Block, index: int) -> bool:
 
 def _kept_scenes() -> Path:
     # Imports the planner, which callers that only need names do not.
-    from mechsearch_jax.problem.cache import cache_folder
+    from mechsearch_jax.runtime.kept_arrays import cache_folder
 
     folder = cache_folder()
     return folder / "scenes" if folder is not None else Path(_temporary_folder().name)

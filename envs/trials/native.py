@@ -211,7 +211,7 @@ def _attempted(
         return TrialResult.UNKNOWN
 
 
-@kept(static_argnames=("target",), on_host=True)
+@kept(on_host=True)
 def _world(
     target: Target, shelf: Shelf, objects: Superquadrics, pose: Float[Array, "3"], found: Bool[Array, ""]
 ) -> World:
@@ -220,7 +220,7 @@ def _world(
     world = bodies(objects)
     return World(
         kind=world.kind.at[TARGET].set(outer_shape(target).code),
-        half_size=world.half_size.at[TARGET].set(jnp.asarray(target.half_size)),
+        half_size=world.half_size.at[TARGET].set(jnp.asarray(target.half_size, jnp.float32)),
         position=world.position.at[TARGET].set(T_world_target[:3, 3]),
         rotation=world.rotation.at[TARGET].set(T_world_target[:3, :3]),
         valid=world.valid.at[TARGET].set(found),

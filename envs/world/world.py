@@ -17,8 +17,9 @@ from mechsearch_jax.envs.world.compounds import Compounds, body_at, body_of, com
 from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.identity import Uncompared
 from mechsearch_jax.shapes import Shape, in_order, shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, Compound
+from mechsearch_jax.shapes.compound import COMPOUND, Compound, half_extents
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.target import Target
 
@@ -26,6 +27,8 @@ TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
 # A target that leans further than this has fallen over [rad].
 MAX_TILT = math.radians(15)
+# Steps of `TargetCompoundWorld.room` [m].
+ROOM = 0.02
 
 
 def fallen_over(rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True) -> bool:
@@ -68,10 +71,17 @@ class TargetCompoundWorld(CompoundWorld):
     """A world whose target is a compound; see `CompoundWorld`.
 
     Attributes:
-      target: what it is made of. Static: worlds side by side have the same target.
+      made_of: the target. Static: worlds side by side have the same; but programs do not depend on it.
+      room: half-extents of a box that has room for it, in steps of `ROOM` [m]; static.
     """
 
-    target: Compound = flax.struct.field(pytree_node=False)
+    made_of: Uncompared[Compound] = flax.struct.field(pytree_node=False)
+    room: tuple[float, float, float] = flax.struct.field(pytree_node=False)
+
+    @property
+    def target(self) -> Compound:
+        """What the target is made of; not for use inside of a program."""
+        return self.made_of.value
 
 
 def slots(scenario: Scenario) -> list[Body | None]:
@@ -112,7 +122,8 @@ def _of_compounds(world: World, bodies: Sequence[Body | None]) -> CompoundWorld:
     fields, target = {**_fields(world), "compounds": compounds_of(bodies)}, bodies[TARGET]
     if target is None or target.compound is None:
         return CompoundWorld(**fields)
-    return TargetCompoundWorld(**fields, target=target.compound)
+    x, y, z = (round(math.ceil(half / ROOM - 1e-6) * ROOM, 3) for half in half_extents(target.compound))
+    return TargetCompoundWorld(**fields, made_of=Uncompared(target.compound), room=(x, y, z))
 
 
 def with_target(world: World, target: Target) -> World:
@@ -131,7 +142,7 @@ def with_target(world: World, target: Target) -> World:
 
 def outer_shape(body: Body | Target) -> Shape:
     """The shape whose code a body has in a `World`: of a compound that of the box around it."""
-    return in_order()[0] if body.compound else shape_of(body.shape)
+    return in_order()[0] if body.shape == COMPOUND else shape_of(body.shape)
 
 
 def _fields(world: World) -> dict[str, Any]:

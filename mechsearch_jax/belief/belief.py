@@ -159,10 +159,12 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
     """The objects and, in one more slot, the target, which is absent until found; and which slot is the target's.
 
     The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp. If it is a
-    compound, all are bodies of parts.
+    compound, all are bodies of parts, but not in a program for a hidden target, in which it is always absent.
     """
     T = belief.grasps.T_world_target
     target = body_at(problem.target, T[:3, 3], T[:3, :3], belief.found)
+    if target.parts is not None and objects.parts is None and belief.grasps.feasible.shape[-1] == 0:
+        target = target.replace(parts=None)
     if target.parts is not None:
         objects = with_parts(objects, target.parts.capacity)
     elif objects.parts is not None:

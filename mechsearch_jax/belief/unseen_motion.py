@@ -54,7 +54,7 @@ def reopened(
     """
     target = problem.target
     places = problem.poses.reshape(-1, target.yaws, 3)[:, 0, :2]
-    radius = target.solid.radius
+    radius = target.radius
     now = jnp.any(exists.reshape(-1, target.yaws), axis=1)
     distance2 = jnp.sum((places[:, None] - places[None]) ** 2, axis=-1)
     opened = jnp.zeros_like(now)

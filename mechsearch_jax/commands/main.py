@@ -15,6 +15,7 @@ import io
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, get_type_hints
 
@@ -33,7 +34,7 @@ from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.study import study
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
-from mechsearch_jax.runtime.errors import InputError, nearest
+from mechsearch_jax.runtime.errors import InputError, Note, nearest
 
 Commands = Mapping[str, Callable[..., None]]
 
@@ -157,10 +158,23 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     return command
 
 
+def _noted(usual: Callable[..., None]) -> Callable[..., None]:
+    """A function that shows a `Note` as a line of its own, and any other warning as usual."""
+
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        if issubclass(category, Note):
+            print(f"mechsearch: {message}", file=sys.stderr)
+        else:
+            usual(message, category, *place)
+
+    return show
+
+
 def main() -> None:
     """The console command `mechsearch`."""
     # Tracing makes millions of small objects that are not garbage: looking for it takes a fifth of a start.
     gc.set_threshold(200_000, 20, 20)
+    warnings.showwarning = _noted(warnings.showwarning)
     try:
         parse(sys.argv[1:])()
     except InputError as error:

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
-from typing import Any
 
 import flax.struct
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.existence.config import ExistenceConfig
 from mechsearch_jax.geometry.transforms import transform, upright_pose
+from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 from mechsearch_jax.workspace.target_view import box_around, extent, framed, surface_cloud, window_image
 
-# Places whose images are computed at once.
-BLOCK = 256
+# Places whose images are computed at once, and the multiple to which the number of places is rounded up.
+BLOCK, ROWS = 32, 1024
+# Sides of the windows of targets of pieces, so that all that are about as large share their programs.
+SIDES = (32, 48, 64, 96, 128)
 
 
 class ExistenceTables(flax.struct.PyTreeNode):
@@ -54,14 +55,7 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     half = np.array(target.half_size, np.float32)
     window, around = target_window(coarse, extent(target)[1], framed(target, T))
 
-    def view(coarse, pose):
-        first, _ = render.window_place(coarse, box_around(target, pose), around)
-        return window_image(coarse, target, pose, window), first
-
-    view_all = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
-    if target.compound is not None:
-        view_all = _in_blocks(view)
-    views, first = jax.jit(view_all)(coarse, T)
+    views, first = (_views_of_pieces if target.is_compound else _views)(coarse, target, T, window, around)
     depth, corner, first = jax.device_get((views.depth, views.corner, first))
     middle = first[:, 0] + np.array(around, np.int32)[None] // 2
     cloud = surface_cloud(target, config.points, config.erosion)
@@ -70,14 +64,60 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     return ExistenceTables(*jax.device_put((T, depth, corner, middle, nearest, cloud.T, radius)))
 
 
-def _in_blocks(view: Callable[[Camera, Array], Any]) -> Callable[[Camera, Array], Any]:
-    """A view at every place (X, S, 4, 4), few at once: the faces of all pieces are tested for every pixel."""
+def _views(
+    coarse: Camera,
+    target: Target,
+    T_world_target: Float[Array, "x s 4 4"],
+    window: tuple[int, int],
+    around: tuple[int, int],
+) -> tuple[render.Window, Int[Array, "x s 2"]]:
+    """The images of a target in windows, and the first rows and columns of windows of another size."""
 
-    def view_all(coarse, T):
-        each = jax.lax.map(lambda pose: view(coarse, pose), T.reshape(-1, 4, 4), batch_size=BLOCK)
-        return jax.tree.map(lambda a: a.reshape(*T.shape[:2], *a.shape[1:]), each)
+    def view(coarse, pose):
+        first, _ = render.window_place(coarse, box_around(target, pose), around)
+        return window_image(coarse, target, pose, window), first
 
-    return view_all
+    return jax.jit(jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0)))(coarse, T_world_target)
+
+
+def _views_of_pieces(
+    coarse: Camera,
+    target: Target,
+    T_world_target: Float[Array, "x s 4 4"],
+    window: tuple[int, int],
+    around: tuple[int, int],
+) -> tuple[render.Window, Int[np.ndarray, "x s 2"]]:
+    """`_views` of a target of pieces, for which the faces of all pieces are tested at every pixel."""
+    rows, columns = (next((side for side in SIDES if side >= least), least) for least in window)
+    T = np.asarray(T_world_target).reshape(-1, 4, 4)
+    # Neighbouring cells have their corners in common.
+    _, index, inverse = np.unique(
+        np.round(T[:, :3], 5).reshape(len(T), -1), axis=0, return_index=True, return_inverse=True
+    )
+    missing = -len(index) % ROWS
+    once = T[np.pad(index, (0, missing), mode="edge")]
+    views, first = jax.device_get(
+        _views_in_blocks(coarse, target, once, np.asarray(around, np.float32), (rows, columns))
+    )
+    shape = T_world_target.shape[:2]
+    return jax.tree.map(lambda a: a[inverse].reshape(*shape, *a.shape[1:]), (views, first))
+
+
+@kept(static_argnames=("window",), on_host=True)
+def _views_in_blocks(
+    coarse: Camera,
+    target: Target,
+    T_world_target: Float[Array, "n 4 4"],
+    around: Float[Array, "2"],
+    window: tuple[int, int],
+) -> tuple[render.Window, Int[Array, "n 2"]]:
+    """The images of a target, few at once, and the first rows and columns of windows of another size."""
+
+    def view(pose):
+        first, _ = render.window_place(coarse, box_around(target, pose), around)
+        return window_image(coarse, target, pose, window), first
+
+    return jax.lax.map(view, T_world_target, batch_size=BLOCK)
 
 
 def _window_side(extent: float) -> int:

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import importlib.metadata
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -23,28 +22,18 @@ from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import keep_in
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import replacing
+from mechsearch_jax.runtime.kept_arrays import cache_folder, forget_old, load_arrays, save_arrays
 from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
-VARIABLE = "MECHSEARCH_CACHE_DIR"
 # So many built problems are kept, for users who switch between versions of the package.
 CACHED_PROBLEMS = 6
 
 _TABLES = {"existence": ExistenceTables, "grasps": CandidateGrasps, "actions": ActionTables, "retrieval": GraspTables}
 _ARRAYS = ("poses", "cell")
-
-
-def cache_folder() -> Path | None:
-    """`MECHSEARCH_CACHE_DIR`, or a folder in the user's cache; None if that variable is set to nothing."""
-    chosen = os.environ.get(VARIABLE)
-    if chosen is not None:
-        return Path(chosen) if chosen else None
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "mechsearch-jax"
 
 
 def keep_compilations() -> None:
@@ -92,7 +81,7 @@ def cached_problem(
         problem = problems.build_problem(**parts)
         with contextlib.suppress(InputError):
             _save(problem, file, key)
-            _forget_old(folder)
+            forget_old(folder, "problem", CACHED_PROBLEMS)
     return problem
 
 
@@ -143,39 +132,24 @@ def _key(parts: dict[str, Any]) -> str:
     return hashlib.sha256(repr(key).encode()).hexdigest()
 
 
-def _digest(arrays: dict[str, np.ndarray], key: str) -> str:
-    digest = hashlib.sha256(key.encode())
-    for name, array in sorted(arrays.items()):
-        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
 def _save(problem: Problem, file: Path, key: str) -> None:
     arrays = {name: np.asarray(getattr(problem, name)) for name in _ARRAYS}
     for table in _TABLES:
         arrays |= {f"{table}.{name}": np.asarray(value) for name, value in vars(getattr(problem, table)).items()}
-    with replacing(file) as target:
-        np.savez(target, allow_pickle=False, **arrays, digest=np.array(_digest(arrays, key)))
+    save_arrays(arrays, file, key)
 
 
 def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
     """The problem in a file; None if it is missing, damaged or has another key."""
+    arrays = load_arrays(file, key)
+    if arrays is None:
+        return None
     try:
-        with np.load(file, allow_pickle=False) as saved:
-            arrays = {name: saved[name] for name in saved.files}
-        if str(arrays.pop("digest")) != _digest(arrays, key):
-            return None
         places = {name: jax.device_put(arrays.pop(name)) for name in _ARRAYS}
         fields: dict[str, dict[str, jax.Array]] = {table: {} for table in _TABLES}
         for name, array in arrays.items():
             table, field = name.split(".")
             fields[table][field] = jax.device_put(array)
         return Problem(**places, **{table: kind(**fields[table]) for table, kind in _TABLES.items()}, **parts)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+    except (ValueError, KeyError, TypeError):
         return None
-
-
-def _forget_old(folder: Path) -> None:
-    files = sorted(folder.glob("problem-*.npz"), key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in files[CACHED_PROBLEMS:]:
-        file.unlink(missing_ok=True)

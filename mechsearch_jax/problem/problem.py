@@ -34,7 +34,8 @@ class Problem(flax.struct.PyTreeNode):
       poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
       cell: their spacing in x and y [m], shape (2,).
       camera, shelf: dynamic but for the image's size, so that other poses compile nothing.
-      gripper, target, config: static.
+      target: static, but for the geometry of one of several pieces.
+      gripper, config: static.
     """
 
     existence: ExistenceTables
@@ -46,7 +47,7 @@ class Problem(flax.struct.PyTreeNode):
     camera: Camera
     shelf: Shelf
     gripper: Gripper = flax.struct.field(pytree_node=False)
-    target: Target = flax.struct.field(pytree_node=False)
+    target: Target
     config: ProblemConfig = flax.struct.field(pytree_node=False)
 
     @property
@@ -92,7 +93,7 @@ def build_problem(
     # This compiles a hundred small programs, which takes longer for a GPU.
     with on_host():
         grasps = candidate_grasps(shelf, gripper, target, config.grasps)
-        if grasps.pair_pose.shape[0] == 0:
+        if grasps.pair_valid.shape[0] == 0:
             raise InputError(NOWHERE)
         tables = {
             "existence": existence_tables(camera, shelf, target, config.existence),

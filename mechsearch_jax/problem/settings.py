@@ -17,7 +17,6 @@ from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
-from mechsearch_jax.shapes.meshes import QUICKLY
 from mechsearch_jax.workspace.compound_file import parse_compound
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
@@ -223,7 +222,7 @@ def _compound_target(document: Document, made_of: dict[str, Any]) -> Target:
         raise InputError(f"{where}: has pieces and a mesh; give one of them")
     unused = ("mesh", "scale") if made_of["pieces"] else ("pieces",)
     value = {key: item for key, item in made_of.items() if key not in unused}
-    compound = parse_compound(value, (), where, Path(document.path).parent, QUICKLY)
+    compound = parse_compound(value, (), where, Path(document.path).parent)
     return apply(document, "target", made_of, lambda _: Target.of_compound(compound))
 
 

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.cloud import Solid, cloud_of
 from mechsearch_jax.robot.kinematics import Numbers
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf
@@ -254,20 +255,9 @@ def _sampled(
     gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
     """`swept_cloud` of checked arguments; cached, because several tables of a problem need the same clouds."""
-    hulls = [
-        _swept_hull(primitive.kind, primitive.size, primitive.T_frame_primitive.tobytes(), distance)
-        for primitive in primitives_in_gripper(gripper, opening, q7)
-    ]
-    areas = np.array([hull.mesh.area for hull in hulls])
-    shares = np.ceil(12 * count * areas / areas.sum()).astype(int) + 50
-    candidates = np.concatenate(
-        [
-            _outside(trimesh.sample.sample_surface(hull.mesh, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
-            for i, (hull, share) in enumerate(zip(hulls, shares, strict=True))
-        ]
-    )
-    spacing = np.where(candidates[:, 2] > gripper.front, FINE, 1.0)
-    return candidates[_spread(candidates, spacing, count)].astype(np.float32)
+    primitives = primitives_in_gripper(gripper, opening, q7)
+    solids: list[Solid] = [(p.kind, p.size, p.T_frame_primitive.tobytes()) for p in primitives]
+    return cloud_of(tuple(solids), gripper.front, FINE, count, distance, seed)
 
 
 def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, "*batch n 3"], Float[Array, " n"]]:
@@ -341,69 +331,3 @@ def _moved(T: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.
 
 def _rotation(angle: float, axis: Literal["x", "y", "z"]) -> np.ndarray:
     return trimesh.transformations.rotation_matrix(angle, np.eye(3)["xyz".index(axis)])
-
-
-def _mesh(primitive: Primitive) -> trimesh.Trimesh:
-    """A primitive's surface; a capsule's facets lie at most half a percent of its radius beneath it."""
-    if primitive.kind == "box":
-        mesh = trimesh.creation.box(extents=2 * np.array(primitive.size))
-    else:
-        radius, half = primitive.size
-        mesh = trimesh.creation.capsule(height=2 * half, radius=radius, count=[32, 32])
-        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))
-    return mesh.apply_transform(primitive.T_frame_primitive)
-
-
-class _Hull(NamedTuple):
-    """A convex mesh, and its faces and bounds as plain arrays: trimesh checks its own for changes at every access."""
-
-    mesh: trimesh.Trimesh
-    normals: np.ndarray
-    offsets: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
-@functools.cache
-def _swept_hull(kind: Literal["box", "capsule"], size: tuple[float, ...], pose: bytes, distance: float) -> _Hull:
-    """The convex hull of a primitive, given by hashable fields, and of its copy `distance` back along z.
-
-    Cached, because only link 6 differs between the angles of joint 7.
-    """
-    mesh = _mesh(Primitive(kind, size, np.frombuffer(pose).reshape(4, 4)))
-    hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
-    normals, centres, bounds = (np.array(a) for a in (hull.face_normals, hull.triangles_center, hull.bounds))
-    return _Hull(hull, normals, np.sum(normals * centres, axis=-1), bounds[0], bounds[1])
-
-
-def _outside(points: np.ndarray, hulls: list[_Hull]) -> np.ndarray:
-    """The points that are not inside any of the convex hulls, to a tenth of a millimetre."""
-    points = np.array(points)
-    for hull in hulls:
-        inside = np.all((points > hull.low) & (points < hull.high), axis=-1)
-        inside[inside] = np.max(points[inside] @ hull.normals.T - hull.offsets, axis=-1, initial=-np.inf) <= -1e-4
-        points = points[~inside]
-    return points
-
-
-def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
-    """Indices of `count` points by farthest-point sampling, with distances relative to the spacing."""
-    chosen = np.empty(count, int)
-    chosen[0] = np.argmax(points[:, 2])
-    gap = np.full(len(points), np.inf)
-    x, y, z = np.array(points.T, order="C")
-    scale = spacing**2
-    distance, square = np.empty_like(gap), np.empty_like(gap)
-    # Column by column and in place, for this loop takes most of a cloud's time.
-    for i in range(1, count):
-        last = chosen[i - 1]
-        np.subtract(x, x[last], out=distance)
-        np.multiply(distance, distance, out=distance)
-        for axis in (y, z):
-            np.subtract(axis, axis[last], out=square)
-            np.multiply(square, square, out=square)
-            np.add(distance, square, out=distance)
-        np.divide(distance, scale, out=distance)
-        np.minimum(gap, distance, out=gap)
-        chosen[i] = np.argmax(gap)
-    return chosen

@@ -18,6 +18,10 @@ class InputError(ValueError):
     """
 
 
+class Note(UserWarning):
+    """One line about a user's input that is used, perhaps not as it was meant; the command line prints it alone."""
+
+
 def shown(value: Any) -> str:
     """A user's value for a message: as JSON, on one line, cut if it is long."""
     try:

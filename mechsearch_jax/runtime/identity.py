@@ -7,11 +7,21 @@ import hashlib
 import inspect
 import io
 import pickle
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 # Packages whose functions and classes are identified by their names. The key of an executable holds a digest of this
 # package's source and the versions of the others.
 KNOWN = ("builtins", "mechsearch_jax", "jax", "jaxlib", "numpy", "flax", "functools", "enum", "pathlib", "copyreg")
+
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Uncompared(Generic[T]):
+    """A static value on which no program depends: it equals any other, and has the same identity."""
+
+    value: T = dataclasses.field(compare=False)
 
 
 class Unidentified(Exception):

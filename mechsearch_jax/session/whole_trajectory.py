@@ -203,7 +203,7 @@ class _Assembly:
         """
         what = grasped(self.problem, self.observation, self.action)
         T_world_gripper = np.asarray(self.action.T_world_gripper, float)
-        foot = self.problem.target.bottom
+        foot = self.problem.target.solid.bottom
         ways = place_ways(self.config.place, T_world_gripper, what.T_world_object if what.seen else None, foot)
         fault: InputError | None = None
         for way in ways:

@@ -20,7 +20,7 @@ from mechsearch_jax.shapes.registry import PRIMITIVES
 # A solid is shrunk to no less than this share of its half-extents.
 LEAST_SHARE = 0.5
 # Beyond every plane of a body [m]: the planes that fill up the rows of polyhedra with fewer faces.
-_FAR = 1e3
+FAR = 1e3
 
 
 class Polyhedra(NamedTuple):
@@ -55,7 +55,7 @@ def polyhedra(compound: Compound) -> Polyhedra | None:
         return None
     rows = [faces(piece) for piece in pieces]
     shape = (len(rows), max(len(row) for row in rows))
-    normal, offset, depth = np.zeros((*shape, 3)), np.full(shape, _FAR), np.full(shape, _FAR)
+    normal, offset, depth = np.zeros((*shape, 3)), np.full(shape, FAR), np.full(shape, FAR)
     for i, (piece, row) in enumerate(zip(pieces, rows, strict=True)):
         turned = row[:, :3] @ piece.rotation.T
         middle = piece.in_body(np.array(piece.vertices)).mean(axis=0)
@@ -167,11 +167,7 @@ def _beyond(rows: Polyhedra, point: Sequence[Any], library: Any) -> Any:
 
 
 def _entered(rows: Polyhedra, offset: np.ndarray, origin: Sequence[Any], direction: Sequence[Any], library: Any) -> Any:
-    """Where rays from outside enter the first polyhedron; infinite for misses.
-
-    Faces are compared by the inverse of the ray parameter, which is finite for rays along them: a ray is inside after
-    it has crossed all planes that its origin is beyond, and before it crosses any other.
-    """
+    """Where rays from outside enter the first polyhedron; infinite for misses."""
     shape = np.broadcast_shapes(origin[0].shape, direction[0].shape)
 
     def full(value: float) -> Any:
@@ -179,19 +175,34 @@ def _entered(rows: Polyhedra, offset: np.ndarray, origin: Sequence[Any], directi
 
     def of_face(state, face):
         normal, offset = face
-        near, far = state
-        gap = offset - _product(normal, origin)
-        inverse = _product(normal, direction) / library.where(library.abs(gap) < 1e-9, 1e-9, gap)
-        before = gap < 0.0
-        near = library.where(before, library.minimum(near, inverse), near)
-        return near, library.where(before, far, library.maximum(far, inverse))
+        return crossed(normal, offset, origin, direction, state, library)
 
     def of_polyhedron(first, faces):
         near, far = _fold(of_face, (full(library.inf), full(0.0)), faces, library)
-        hit = (near > 0.0) & (near >= far) & library.isfinite(near)
-        return library.minimum(first, library.where(hit, 1.0 / library.where(hit, near, 1.0), library.inf))
+        return library.minimum(first, entry(near, far, library))
 
     return _fold(of_polyhedron, full(library.inf), (rows.normal, offset), library)
+
+
+def crossed(normal: Any, offset: Any, origin: Sequence[Any], direction: Sequence[Any], state: Any, library: Any) -> Any:
+    """The state of rays that meet the faces of a polyhedron one after the other, after one more face n . x <= d.
+
+    Faces are compared by the inverse of the ray parameter, which is finite for rays along them: a ray is inside after
+    it has crossed all planes that its origin is beyond, and before it crosses any other. The state begins as (infinity,
+    0): the least inverse of the former, and the largest of the latter.
+    """
+    near, far = state
+    gap = offset - _product(normal, origin)
+    inverse = _product(normal, direction) / library.where(library.abs(gap) < 1e-9, 1e-9, gap)
+    before = gap < 0.0
+    near = library.where(before, library.minimum(near, inverse), near)
+    return near, library.where(before, far, library.maximum(far, inverse))
+
+
+def entry(near: Any, far: Any, library: Any) -> Any:
+    """Where rays enter a polyhedron, from their state after its last face, see `crossed`; infinite for misses."""
+    hit = (near > 0.0) & (near >= far) & library.isfinite(near)
+    return library.where(hit, 1.0 / library.where(hit, near, 1.0), library.inf)
 
 
 def reach(compound: Compound, direction: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:

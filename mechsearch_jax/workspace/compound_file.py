@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.shapes import PRIMITIVES, frustum
 from mechsearch_jax.shapes.compound import CONVEX, IDENTITY, MOST_SOLIDS, MOST_VERTICES, Compound, Piece, solids
-from mechsearch_jax.shapes.meshes import THOROUGHLY, convex_pieces
+from mechsearch_jax.shapes.meshes import convex_pieces
 from mechsearch_jax.workspace.json_checks import check_keys, check_norm, number, numbers
 
 # Bounds of a piece's half-extents [m], of densities [kg/m3], of friction, and of the scale of meshes [m].
@@ -31,13 +31,7 @@ def is_compound(value: Any) -> bool:
     return isinstance(value, dict) and bool({"pieces", "mesh"} & set(value))
 
 
-def parse_compound(
-    value: dict[str, Any],
-    pose: Sequence[str],
-    where: str,
-    folder: Path,
-    cut: Mapping[str, int] = THOROUGHLY,
-) -> Compound:
+def parse_compound(value: dict[str, Any], pose: Sequence[str], where: str, folder: Path) -> Compound:
     """What a body of a scenario file is made of, in the file's frame of the body.
 
     Args:
@@ -45,16 +39,13 @@ def parse_compound(
       pose: the body's other keys, which are not read.
       where: how messages name the body.
       folder: from which paths of meshes count.
-      cut: how meshes are cut, see `meshes.convex_pieces`.
 
     Raises:
       InputError: a key is unknown or missing, a number is out of range, or a mesh cannot be used.
     """
     source, more = ("mesh", ("color", "scale")) if "mesh" in value else ("pieces", ("color",))
     check_keys(value, (source, *_SHARED, *pose), where, more)
-    pieces = (
-        _mesh_pieces(value, where, folder, cut) if source == "mesh" else _pieces(value["pieces"], f"{where}.pieces")
-    )
+    pieces = _mesh_pieces(value, where, folder) if source == "mesh" else _pieces(value["pieces"], f"{where}.pieces")
     colour = None
     if "color" in value:
         colour = numbers(value["color"], 3, f"{where}.color")
@@ -65,11 +56,11 @@ def parse_compound(
     return Compound(pieces, density, friction, colour)  # pyright: ignore[reportArgumentType]
 
 
-def _mesh_pieces(value: dict[str, Any], where: str, folder: Path, cut: Mapping[str, int]) -> tuple[Piece, ...]:
+def _mesh_pieces(value: dict[str, Any], where: str, folder: Path) -> tuple[Piece, ...]:
     if not isinstance(value["mesh"], str) or not value["mesh"]:
         raise InputError(f"{where}.mesh: {shown(value['mesh'])} must be the path of a mesh file")
     scale = number(value.get("scale", 1.0), *SCALES, "metres per unit of the mesh", f"{where}.scale")
-    pieces = convex_pieces(folder / value["mesh"], scale, f"{where}.mesh", cut)
+    pieces = convex_pieces(folder / value["mesh"], scale, f"{where}.mesh")
     for piece in pieces:
         _check_polyhedron(np.array(piece.vertices), f"{where}.mesh", "give its unit as scale, such as 0.001")
     return pieces

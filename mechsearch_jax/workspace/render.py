@@ -111,7 +111,7 @@ class Window(flax.struct.PyTreeNode):
 
 
 def window_place(
-    camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
+    camera: Camera, scene_object: Superquadrics, window: tuple[int, int] | Float[Array, "2"]
 ) -> tuple[Int[Array, "2"], Int[Array, ""]]:
     """First row and column, and stride, of a window that contains the image of an object.
 

@@ -8,18 +8,21 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.identity import Uncompared
 from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
-from mechsearch_jax.shapes.meshes import QUICKLY
+from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents
+from mechsearch_jax.shapes.meshes import LEAST_THICKNESS, thickness
 from mechsearch_jax.shapes.solid import Solid, Union, Whole
 from mechsearch_jax.workspace.compound_file import format_compound, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target_data import TargetData, target_data
 
 if TYPE_CHECKING:
     from mechsearch_jax.workspace.scenario import Body
@@ -35,15 +38,20 @@ DENSITY, FRICTION = 600.0, 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """An upright target of known shape.
+    """An upright target of known shape; a pytree.
+
+    Of a box or a cylinder all is static: each has its own programs. A target of several pieces has its geometry as
+    arrays, so that all such targets with as many candidate poses share theirs. Inside of a program it has neither
+    `compound` nor `solid`, but `data` and all other properties.
 
     Attributes:
       shape: name of its shape; "compound" of a target of several pieces.
       half_size: half-extents [m]; of a compound those of the smallest box about its centre of mass.
       grid: number of candidate positions in x and y.
-      inset: distance between the outermost candidate positions and the board's edges [m].
+      inset: distance between the outermost candidate positions and the board's edges [m]; see `margin`.
       yaws: number of candidate yaw angles over a `turn`; 1 for a round target.
       compound: what a target of several pieces is made of, in the frame of its centre of mass; None for any other.
+      traced: its geometry, inside of a program; not for use elsewhere.
     """
 
     shape: str = "cylinder"
@@ -52,10 +60,12 @@ class Target:
     inset: float = 0.05
     yaws: int = 1
     compound: Compound | None = None
+    traced: TargetData | None = dataclasses.field(default=None, compare=False)
 
     def __repr__(self) -> str:
         # Without a compound as before there were any: the text identifies saved problems and searches.
-        fields = [field.name for field in dataclasses.fields(self) if field.name != "compound" or self.compound]
+        left_out = {"traced"} if self.compound else {"compound", "traced"}
+        fields = [field.name for field in dataclasses.fields(self) if field.name not in left_out]
         return f"Target({', '.join(f'{name}={getattr(self, name)!r}' for name in fields)})"
 
     def __post_init__(self):
@@ -130,7 +140,7 @@ class Target:
             or too large, as where `scale` is that of another unit.
         """
         given = {"mesh": os.fspath(path), "scale": scale, "density": density, "friction": friction}
-        return cls.of_compound(parse_compound(given, (), f"{path}: target", Path(), QUICKLY))
+        return cls.of_compound(parse_compound(given, (), f"{path}: target", Path()))
 
     @classmethod
     def of_body(cls, body: Body) -> Target:
@@ -153,8 +163,14 @@ class Target:
         """The target that a compound is, which stands upright in its frame, z up.
 
         Raises:
-          InputError: it is too large.
+          InputError: it is too large, or a polyhedron is too thin.
         """
+        thin = min((thickness(piece)[0] for piece in compound.pieces if piece.shape == CONVEX), default=1.0)
+        if thin < 0.99 * LEAST_THICKNESS:
+            raise InputError(
+                f"Target: a piece is {1e3 * thin:.2g} mm thick; make it at least {1e3 * LEAST_THICKNESS:g} mm thick, or"
+                " give a mesh, whose pieces are made so"
+            )
         # Its colour is the detector's, whatever the compound's own.
         compound = dataclasses.replace(centred(compound)[0], colour=None)
         return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
@@ -188,43 +204,79 @@ class Target:
     @property
     def exponents(self) -> tuple[float, float]:
         """Of the superquadric that represents it in plans; of a compound, whose parts do, of a box around it."""
-        return shape_of("box" if self.compound else self.shape).exponents
+        return shape_of("box" if self.is_compound else self.shape).exponents
 
     @property
     def solid(self) -> Solid:
         """Its geometry."""
+        assert self.traced is None, "inside of a program a target of pieces is data"
         return Union(self.compound) if self.compound else Whole(shape_of(self.shape), self.half_size)
+
+    @property
+    def is_compound(self) -> bool:
+        """Whether it is of several pieces."""
+        return self.shape == COMPOUND
+
+    @property
+    def data(self) -> TargetData:
+        """The geometry of a target of several pieces, as arrays."""
+        if self.traced is not None:
+            return self.traced
+        assert self.compound is not None
+        return target_data(self.compound)
 
     @property
     def turn(self) -> float:
         """The yaw after which it looks the same [rad]: half a turn, or a full one."""
-        return self.solid.turn
+        return self.solid.turn if self.traced is None else self.traced.turn
 
     @property
-    def bottom(self) -> float:
+    def round(self) -> bool:
+        """Whether it is a solid of revolution about its vertical axis."""
+        return self.solid.round if self.traced is None else self.traced.round
+
+    @property
+    def bottom(self) -> float | Array:
         """How far its lowest point is below its centre [m]."""
-        return self.solid.bottom
+        return self.solid.bottom if self.traced is None else self.traced.bottom
 
     @property
-    def top(self) -> float:
+    def top(self) -> float | Array:
         """How far its highest point is above its centre [m]."""
-        return self.solid.top
+        return self.solid.top if self.traced is None else self.traced.top
 
     @property
-    def tall(self) -> float:
+    def radius(self) -> float | Array:
+        """Largest distance of a point from the vertical axis through its centre [m]."""
+        return self.solid.radius if self.traced is None else self.traced.radius
+
+    @property
+    def tall(self) -> float | Array:
         """Its height [m]."""
         return self.bottom + self.top
+
+    @property
+    def margin(self) -> float:
+        """Distance between the outermost candidate positions and the board's edges [m]: the inset, or the radius of a
+        target that would be in a wall there at some yaw."""
+        return max(self.inset, math.ceil(1e3 * self.solid.radius - 1e-6) / 1e3)
 
     def height(self, shelf: Shelf) -> float | Array:
         """z of the centre of a target that stands on the board [m]; the shelf may be traced."""
         return shelf.board + self.bottom
 
     def check_fits(self, shelf: Shelf) -> None:
-        """Check that it is lower than the shelf.
+        """Check that it is lower than the shelf, and narrower than its board.
 
         Raises:
           InputError: it is not.
         """
+        deep, wide = float(shelf.back - shelf.front), float(shelf.left - shelf.right)
+        if not 2 * self.margin < min(deep, wide):
+            raise InputError(
+                f"Target: it reaches {self.solid.radius:.3f} m from its middle, too far for a board of {deep:g} m x"
+                f" {wide:g} m; use a smaller one, or write its scale, if it is in another unit"
+            )
         room = float(shelf.ceiling - shelf.board)
         if self.tall > room:
             raise InputError(
@@ -234,10 +286,10 @@ class Target:
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
         """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.
 
-        The outermost positions are `inset` from the board's edges; the default spacing is 15 to 16 mm.
+        The outermost positions are `margin` from the board's edges; the default spacing is 15 to 16 mm.
         """
-        x = np.linspace(shelf.front + self.inset, shelf.back - self.inset, self.grid[0])
-        y = np.linspace(shelf.right + self.inset, shelf.left - self.inset, self.grid[1])
+        x = np.linspace(shelf.front + self.margin, shelf.back - self.margin, self.grid[0])
+        y = np.linspace(shelf.right + self.margin, shelf.left - self.margin, self.grid[1])
         yaw = np.arange(self.yaws) * self.turn / self.yaws
         return np.stack(np.meshgrid(x, y, yaw, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
 
@@ -253,7 +305,7 @@ class Target:
         """
         poses = self.candidate_poses(shelf)
         offsets = np.tile(shares * np.array(self.cell(shelf), np.float32) / 2, (len(poses), 1, 1))
-        outward = max(self.inset - self.solid.breadth, 0.0)
+        outward = max(self.margin - self.solid.breadth, 0.0)
         for axis, side in ((0, 1.0), (1, 1.0), (1, -1.0)):
             outermost = poses[:, axis] * side == np.max(poses[:, axis] * side)
             offsets[np.ix_(outermost, shares[:, axis] == side, [axis])] = side * outward
@@ -262,7 +314,32 @@ class Target:
     def cell(self, shelf: Shelf) -> tuple[float, float, float]:
         """Spacing of the candidate poses in x, y [m] and yaw [rad]."""
         return (
-            (shelf.back - shelf.front - 2 * self.inset) / (self.grid[0] - 1),
-            (shelf.left - shelf.right - 2 * self.inset) / (self.grid[1] - 1),
+            (shelf.back - shelf.front - 2 * self.margin) / (self.grid[0] - 1),
+            (shelf.left - shelf.right - 2 * self.margin) / (self.grid[1] - 1),
             self.turn / self.yaws if self.yaws > 1 else 0.0,
         )
+
+
+def _flattened(target: Target) -> tuple[tuple[TargetData, ...], Any]:
+    if not target.is_compound:
+        return (), target
+    # A program does not depend on the target that the arrays were made of.
+    made_of = Uncompared(target if target.traced is None else None)
+    return (target.data,), (target.grid, target.yaws, made_of)
+
+
+def _unflattened(static: Any, children: tuple[TargetData, ...]) -> Target:
+    if isinstance(static, Target):
+        return static
+    (data,), (grid, yaws, made_of) = children, static
+    if made_of.value is not None and isinstance(data, TargetData) and data.is_of(made_of.value.compound):
+        return made_of.value
+    target = object.__new__(Target)
+    values = {"shape": COMPOUND, "grid": grid, "yaws": yaws, "inset": math.nan, "compound": None, "traced": data}
+    for name, value in values.items():
+        object.__setattr__(target, name, value)
+    object.__setattr__(target, "half_size", getattr(data, "half_size", None))
+    return target
+
+
+jax.tree_util.register_pytree_node(Target, _flattened, _unflattened)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, read_json
 from mechsearch_jax.shapes.compound import CONVEX, Piece
-from mechsearch_jax.shapes.meshes import QUICKLY
 from mechsearch_jax.workspace.compound_file import is_compound, parse_compound
 from mechsearch_jax.workspace.json_checks import check_norm, numbers
 from mechsearch_jax.workspace.target import Target
@@ -28,7 +27,7 @@ def load_target(path: PathLike, scale: float = 1.0) -> Target:
     `scale`, and no place; `quaternion` turns it upright, z up, if it is not already. Any other file is a mesh, z up.
 
     Args:
-      path: of the file. A mesh is cut quickly, see `meshes.convex_pieces`.
+      path: of the file. For meshes see `meshes.convex_pieces`.
       scale: metres per unit of a mesh; in a JSON file that is a key.
 
     Raises:
@@ -48,7 +47,7 @@ def load_target(path: PathLike, scale: float = 1.0) -> Target:
         check_norm(quaternion, f"{file}: {TURN}")
         turn = Rotation.from_quat(quaternion, scalar_first=True)
     body = {key: entry for key, entry in value.items() if key != TURN}
-    compound = parse_compound(body, (), str(file), file.parent, QUICKLY)
+    compound = parse_compound(body, (), str(file), file.parent)
     pieces = [_turned(piece, turn) for piece in compound.pieces]
     return Target.from_parts(pieces, compound.density, compound.friction)
 

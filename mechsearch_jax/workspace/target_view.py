@@ -17,8 +17,7 @@ from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import placed_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, transform
-from mechsearch_jax.shapes import solid, union
-from mechsearch_jax.shapes.parts import part_rows
+from mechsearch_jax.shapes import solid
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.target import Target
@@ -40,13 +39,15 @@ def body_at(
     parts = None
 
     def constant(row: Any) -> Array:
+        if isinstance(row, jax.Array):
+            return jnp.broadcast_to(row, (*valid.shape, *row.shape))
         return jnp.asarray(np.broadcast_to(row, (*valid.shape, *row.shape)))
 
-    if target.compound is not None:
-        rows: Any = (constant(row) for row in part_rows(target.compound))
+    if target.is_compound:
+        rows: Any = (constant(row) for row in target.data.parts)
         parts = Superquadrics(*rows)
     return Superquadrics(
-        size=constant(np.array(target.half_size, np.float32)),
+        size=constant(_half_size(target)),
         exponents=constant(np.array(target.exponents, np.float32)),
         position=position,
         rotation=rotation,
@@ -67,9 +68,9 @@ def main_body(
       target, position, rotation, valid: as of `body_at`.
     """
     body = body_at(target, position, rotation, valid)
-    if target.compound is None:
+    if not target.is_compound:
         return body
-    largest = int(np.argmax(part_rows(target.compound)[0].prod(axis=1)))
+    largest = jnp.argmax(jnp.prod(jnp.asarray(target.data.parts[0]), axis=1))
     axis = len(valid.shape)
     return jax.tree.map(lambda a: jnp.take(a, largest, axis=axis), placed_parts(body))
 
@@ -86,7 +87,7 @@ def window_image(
       window: rows and columns; static.
     """
     box = box_around(target, T_world_target)
-    if target.compound is None:
+    if not target.is_compound:
         return render.object_window(camera, box, window)
     corner, stride = render.window_place(camera, box, window)
     rows, columns = jnp.meshgrid(jnp.arange(window[0]), jnp.arange(window[1]), indexing="ij")
@@ -95,19 +96,24 @@ def window_image(
     R, offset = T_world_target[:3, :3], jnp.array(camera.position) - T_world_target[:3, 3]
     origin = [jnp.reshape(sum(offset[j] * R[j, i] for j in range(3)), (1, 1)) for i in range(3)]
     local = [sum(along[..., j] * R[j, i] for j in range(3)) for i in range(3)]
-    return render.Window(union.cut(target.compound, origin, local, 0.0, jnp), corner, stride)
+    return render.Window(target.data.cut(origin, local), corner, stride)
 
 
-def extent(target: Target) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+def _half_size(target: Target) -> Any:
+    """Half-extents [m], float32."""
+    return target.data.half_size if target.is_compound else np.array(target.half_size, np.float32)
+
+
+def extent(target: Target) -> tuple[Float[Numbers, " 3"], Float[Numbers, " 3"]]:
     """The middle of the smallest box around the target along its axes, and its half-extents [m], float32."""
-    against, along = target.solid.extent(np.eye(3), np)
-    middle, half = np.stack([along - against, along + against]).astype(np.float32) / 2
-    return middle, half
+    if target.is_compound:
+        return target.data.middle, target.data.half
+    return np.zeros(3, np.float32), _half_size(target)
 
 
 def framed(target: Target, T_world_target: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
     """Poses of the box of `extent` from the target's; for a box or a cylinder they are the same."""
-    if target.compound is None:
+    if not target.is_compound:
         return T_world_target
     middle = transform(T_world_target[..., None, :, :], jnp.asarray(extent(target)[0])[None])[..., 0, :]
     return make(T_world_target[..., :3, :3], middle)
@@ -117,7 +123,7 @@ def box_around(target: Target, T_world_target: Float[Array, "4 4"]) -> Superquad
     """The box of `extent` at a pose of the target, or the target itself if it is one superquadric."""
     T_world_box = framed(target, T_world_target)
     return Superquadrics(
-        size=jnp.float32(target.half_size if target.compound is None else extent(target)[1]),
+        size=jnp.float32(extent(target)[1]),
         exponents=jnp.float32(target.exponents),
         position=T_world_box[:3, 3],
         rotation=T_world_target[:3, :3],
@@ -126,9 +132,11 @@ def box_around(target: Target, T_world_target: Float[Array, "4 4"]) -> Superquad
 
 
 def surface_cloud(target: Target, count: int, erosion: float) -> Float[np.ndarray, "n 3"]:
-    """At most `count` points on the surface of the target shrunk by `erosion`, in its own frame [m]."""
+    """`count` points on the surface of the target shrunk by `erosion`, in its own frame [m]."""
     if target.compound is None:
         sample = jax.jit(superquadric.sample_surface, static_argnames="count")
         half = np.array(target.half_size, np.float32) - np.float32(erosion)
         return np.asarray(sample(half, np.array(target.exponents, np.float32), count=count))
-    return solid.surface(target.compound, count, erosion).astype(np.float32)
+    points = solid.surface(target.compound, count, erosion).astype(np.float32)
+    # As many for every target, so that all share their programs.
+    return points[np.arange(count) % len(points)]
