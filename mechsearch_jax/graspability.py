@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.candidate_pairs import PIECES_PAIRS, ROUND_PAIRS, filled_up, pair_tables
-from mechsearch_jax.compound_grasps import MOST, closings
+from mechsearch_jax.compound_grasps import axes, closings, most_closings
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
@@ -62,6 +62,8 @@ class GraspConfig:
       still_points: points on the gripper at rest, and on the target, for the crossing with a found target.
       waypoints: number of poses on an approach at which inverse kinematics must succeed.
       erosion: by how much the target is shrunk for the collision test of its way out [m].
+      rolls, steep: for targets of several pieces, angles beside 0 by which the hand is turned about its approach, and
+        more tilts [rad].
     """
 
     yaws: int = 7
@@ -77,6 +79,9 @@ class GraspConfig:
     still_points: tuple[int, int] = (512, 128)
     waypoints: int = 4
     erosion: float = 0.001
+    # Not in the representation, which identifies saved problems: those of boxes and cylinders do not depend on them.
+    rolls: tuple[float, ...] = dataclasses.field(default=(), repr=False)
+    steep: tuple[float, ...] = dataclasses.field(default=(), repr=False)
 
     def __post_init__(self):
         if self.yaws < 1 or not self.tilts or not self.wrists:
@@ -87,8 +92,13 @@ class GraspConfig:
     @classmethod
     def dense(cls) -> GraspConfig:
         """Ten times as many grasps as the default, for the single pose of a found target."""
-        tilts, wrists = (20.0, 22.5, 25.0, 27.5, 30.0), (-60.0, -30.0, 0.0, 30.0, 60.0)
-        return cls(yaws=25, tilts=tuple(map(math.radians, tilts)), wrists=tuple(map(math.radians, wrists)))
+        angles = {
+            "tilts": (20.0, 22.5, 25.0, 27.5, 30.0),
+            "wrists": (-60.0, -30.0, 0.0, 30.0, 60.0),
+            "rolls": (-60.0, -30.0, 30.0, 60.0),
+            "steep": (40.0, 50.0),
+        }
+        return cls(yaws=25, **{name: tuple(map(math.radians, degrees)) for name, degrees in angles.items()})
 
 
 class GraspTables(flax.struct.PyTreeNode):
@@ -174,9 +184,10 @@ def _compound_grasps(
     """`_target_grasps` of a target of pieces: each closing of `compound_grasps` at the tilts that it allows."""
     directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
     yaws = directions.tolist() if target.solid.round else None
-    found = closings(compound, gripper, yaws, config.tilts, config.height)
+    tilts = (*config.tilts, *config.steep)
+    found = closings(compound, gripper, yaws, tilts, config.height, config.rolls)
     rows = [
-        (found.yaw[i], config.tilts[tilt], wrist, *found.point[i])
+        (found.yaw[i], tilts[tilt], found.roll[i], wrist, *found.point[i])
         for i in range(len(found.yaw))
         for tilt in found.tilts[i]
         for wrist in range(len(config.wrists))
@@ -187,8 +198,10 @@ def _compound_grasps(
             " open fingers reach from the side; use another target"
         )
     table = np.array(rows)
-    yaw, tilt, point = (table[:, columns].astype(np.float32) for columns in (0, 1, slice(3, None)))
-    return _posed(yaw, tilt, point), table[:, 2].astype(int)
+    T = np.tile(np.eye(4), (len(table), 1, 1))
+    T[:, :3, :3] = [axes(*angles) for angles in table[:, :3]]
+    T[:, :3, 3] = table[:, 4:]
+    return jnp.asarray(T, jnp.float32), table[:, 3].astype(int)
 
 
 def feasible_grasps(
@@ -222,7 +235,9 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     T_target_gripper, wrist = _target_grasps(target, gripper, config)
     count = len(wrist)
     if target.is_compound:
-        T_target_gripper, wrist = filled_up(T_target_gripper, wrist, MOST * len(config.tilts) * len(config.wrists))
+        tilts = len(config.tilts) + len(config.steep)
+        most = most_closings(config.rolls) * tilts * len(config.wrists)
+        T_target_gripper, wrist = filled_up(T_target_gripper, wrist, most)
     angles = [WRIST_ORIGIN + a for a in config.wrists]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]

@@ -1,5 +1,12 @@
 """`mechsearch bench`: how long the parts take, how good they are, and what whole episodes come to."""
 
-from mechsearch_jax.commands.bench import cells, episodes, looks, quality, timing
+from mechsearch_jax.commands.bench import cells, episodes, looks, quality, targets, timing
 
-COMMANDS = {**timing.COMMANDS, **quality.COMMANDS, **looks.COMMANDS, **cells.COMMANDS, **episodes.COMMANDS}
+COMMANDS = {
+    **timing.COMMANDS,
+    **quality.COMMANDS,
+    **looks.COMMANDS,
+    **cells.COMMANDS,
+    **targets.COMMANDS,
+    **episodes.COMMANDS,
+}
