@@ -92,13 +92,17 @@ class GraspConfig:
     @classmethod
     def dense(cls) -> GraspConfig:
         """Ten times as many grasps as the default, for the single pose of a found target."""
-        angles = {
-            "tilts": (20.0, 22.5, 25.0, 27.5, 30.0),
-            "wrists": (-60.0, -30.0, 0.0, 30.0, 60.0),
-            "rolls": (-60.0, -30.0, 30.0, 60.0),
-            "steep": (40.0, 50.0),
-        }
-        return cls(yaws=25, **{name: tuple(map(math.radians, degrees)) for name, degrees in angles.items()})
+
+        def angles(*degrees: float) -> tuple[float, ...]:
+            return tuple(map(math.radians, degrees))
+
+        return cls(
+            yaws=25,
+            tilts=angles(20.0, 22.5, 25.0, 27.5, 30.0),
+            wrists=angles(-60.0, -30.0, 0.0, 30.0, 60.0),
+            rolls=angles(-60.0, -30.0, 30.0, 60.0),
+            steep=angles(40.0, 50.0),
+        )
 
 
 class GraspTables(flax.struct.PyTreeNode):
