@@ -101,6 +101,8 @@ def test_pairs_are_thinned_evenly_and_none_is_made_up(able, most):
     count = kept.sum(axis=1)
     assert count.max() <= most
     assert count.sum() <= max(len(able) * most // 2, 0)
+    # With room for one pair at each pose, none is left without.
+    assert most < 2 or ((count > 0) == able.any(axis=1)).all()
     if np.minimum(able.sum(axis=1), most).sum() <= len(able) * most // 2:
         np.testing.assert_array_equal(count, np.minimum(able.sum(axis=1), most))
 
