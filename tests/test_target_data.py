@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays
 from test_workspace_target import BOTTLE, CUP, TEE
 
 from mechsearch_jax.candidate_pairs import filled_up, pair_tables, thinned
+from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import GraspConfig, feasible_grasps, grasp_tables
 from mechsearch_jax.robot.gripper import Gripper
@@ -157,3 +158,9 @@ def test_a_target_wider_than_the_board_and_one_too_thin_are_refused_in_one_line(
             make()
         assert message in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+def test_a_target_that_the_arm_reaches_nowhere_hides_in_no_scene():
+    generator = ScenarioGenerator(HOOK, graspable=lambda pose: False)
+    with pytest.raises(InputError, match="the arm reaches it nowhere on the board"):
+        generator.generate(0, 3)
