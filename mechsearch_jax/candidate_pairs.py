@@ -57,8 +57,8 @@ def thinned(able: Bool[np.ndarray, "x g"], most: int) -> Bool[np.ndarray, "x g"]
 
     What is left out lies evenly between what stays: neighbouring grasps are alike.
     """
-    count = able.sum(axis=1)
-    while np.minimum(count, most).sum() > len(able) * most // 2:
+    count, room = able.sum(axis=1), len(able) * most // 2
+    while np.minimum(count, most).sum() > room:
         most -= 1
     kept = np.minimum(count, most)
     rank = np.cumsum(able, axis=1) - 1

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mechsearch_jax.geometry.swept_cloud import mesh_of
 from mechsearch_jax.robot import gripper as module
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import FINGER, HAND, LINKS, Gripper, Primitive
@@ -51,7 +52,12 @@ def union_distance(primitives: tuple[Primitive, ...], points: np.ndarray, swept:
 
 def surface(primitives: tuple[Primitive, ...]) -> np.ndarray:
     """Points all over the surface of a union."""
-    points = np.concatenate([trimesh.sample.sample_surface(module._mesh(one), 20000, seed=1)[0] for one in primitives])
+    points = np.concatenate(
+        [
+            trimesh.sample.sample_surface(mesh_of(one.kind, one.size, one.T_frame_primitive), 20000, seed=1)[0]
+            for one in primitives
+        ]
+    )
     return points[union_distance(primitives, points) > -3e-4]
 
 
@@ -138,7 +144,9 @@ def test_the_approach_ends_at_the_tips():
 
 def bounding_box(primitives: tuple[Primitive, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Half-extents and centre of the smallest upright box around primitives."""
-    bounds = np.array([module._mesh(primitive).bounds for primitive in primitives])
+    bounds = np.array(
+        [mesh_of(primitive.kind, primitive.size, primitive.T_frame_primitive).bounds for primitive in primitives]
+    )
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     return (high - low) / 2, (high + low) / 2
 

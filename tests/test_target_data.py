@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays
 from test_workspace_target import BOTTLE, CUP, TEE
 
 from mechsearch_jax.candidate_pairs import filled_up, pair_tables, thinned
+from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import GraspConfig, feasible_grasps, grasp_tables
 from mechsearch_jax.robot.gripper import Gripper
@@ -101,6 +102,8 @@ def test_pairs_are_thinned_evenly_and_none_is_made_up(able, most):
     count = kept.sum(axis=1)
     assert count.max() <= most
     assert count.sum() <= max(len(able) * most // 2, 0)
+    # With room for one pair at each pose, none is left without.
+    assert most < 2 or ((count > 0) == able.any(axis=1)).all()
     if np.minimum(able.sum(axis=1), most).sum() <= len(able) * most // 2:
         np.testing.assert_array_equal(count, np.minimum(able.sum(axis=1), most))
 
@@ -155,3 +158,9 @@ def test_a_target_wider_than_the_board_and_one_too_thin_are_refused_in_one_line(
             make()
         assert message in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+def test_a_target_that_the_arm_reaches_nowhere_hides_in_no_scene():
+    generator = ScenarioGenerator(HOOK, graspable=lambda pose: False)
+    with pytest.raises(InputError, match="the arm reaches it nowhere on the board"):
+        generator.generate(0, 3)

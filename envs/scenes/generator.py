@@ -221,6 +221,10 @@ class ScenarioGenerator:
             raise InputError(f"objects: {objects} is not between 1 and {MAX_OBJECTS}")
         if seed < 0:
             raise InputError(f"seed: {seed} is negative; use a whole number from 0")
+        if not len(self._poses):
+            raise InputError(
+                "Target: the arm reaches it nowhere on the board with a grasp that fits it; use a smaller one"
+            )
         name = name or f"generated-{objects}-{seed}"
         rng = np.random.default_rng([seed, objects])
         for _ in range(self.config.attempts):

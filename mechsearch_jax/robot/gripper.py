@@ -22,8 +22,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.geometry.swept_cloud import Solid, cloud_of
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.cloud import Solid, cloud_of
 from mechsearch_jax.robot.kinematics import Numbers
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import numpy as np
@@ -51,7 +51,6 @@ class Target:
       inset: distance between the outermost candidate positions and the board's edges [m]; see `margin`.
       yaws: number of candidate yaw angles over a `turn`; 1 for a round target.
       compound: what a target of several pieces is made of, in the frame of its centre of mass; None for any other.
-      traced: its geometry, inside of a program; not for use elsewhere.
     """
 
     shape: str = "cylinder"
@@ -60,12 +59,12 @@ class Target:
     inset: float = 0.05
     yaws: int = 1
     compound: Compound | None = None
-    traced: TargetData | None = dataclasses.field(default=None, compare=False)
+    # The geometry of a target of pieces inside of a program; None elsewhere.
+    traced: ClassVar[TargetData | None] = None
 
     def __repr__(self) -> str:
         # Without a compound as before there were any: the text identifies saved problems and searches.
-        left_out = {"traced"} if self.compound else {"compound", "traced"}
-        fields = [field.name for field in dataclasses.fields(self) if field.name not in left_out]
+        fields = [field.name for field in dataclasses.fields(self) if field.name != "compound" or self.compound]
         return f"Target({', '.join(f'{name}={getattr(self, name)!r}' for name in fields)})"
 
     def __post_init__(self):

@@ -52,7 +52,7 @@ def _cloud(
     return candidates[_spread(candidates, spacing, count)].astype(np.float32)
 
 
-def _mesh(kind: Kind, size: tuple[float, ...], pose: np.ndarray) -> trimesh.Trimesh:
+def mesh_of(kind: Kind, size: tuple[float, ...], pose: np.ndarray) -> trimesh.Trimesh:
     """A primitive's surface; a capsule's facets lie at most half a percent of its radius beneath it."""
     if kind == "box":
         mesh = trimesh.creation.box(extents=2 * np.array(size))
@@ -79,7 +79,7 @@ def _swept_hull(kind: Kind, size: tuple[float, ...], pose: bytes, distance: floa
 
     Cached, because only link 6 differs between the angles of joint 7.
     """
-    mesh = _mesh(kind, size, np.frombuffer(pose).reshape(4, 4))
+    mesh = mesh_of(kind, size, np.frombuffer(pose).reshape(4, 4))
     hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
     normals, centres, bounds = (np.array(a) for a in (hull.face_normals, hull.triangles_center, hull.bounds))
     return _Hull(hull, normals, np.sum(normals * centres, axis=-1), bounds[0], bounds[1])
