@@ -39,7 +39,6 @@ from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes.compound import centred
-from mechsearch_jax.shapes.meshes import QUICKLY
 from mechsearch_jax.workspace.compound_file import parse_compound
 from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
 
@@ -120,7 +119,7 @@ def load(given: GivenMesh) -> Mesh:
     import trimesh
 
     value = {"mesh": str(given.file), "scale": given.scale, "density": DENSITY, "friction": FRICTION}
-    compound = parse_compound(value, (), f"{given.file}: target", Path(), QUICKLY)
+    compound = parse_compound(value, (), f"{given.file}: target", Path())
     target = Target.of_compound(compound)
     surface: Any = trimesh.load(str(given.file), force="mesh", process=True)
     surface.apply_scale(given.scale)
@@ -269,19 +268,20 @@ class Bench:
         # All have one size, so that nothing is compiled twice.
         rows = np.resize(np.arange(len(T)), AT_ONCE)
         motion = dataclasses.replace(self.trials.simulation.motion, gripper=gripper)
-        follows = np.asarray(_follows(T[rows], q7[rows], motion))[: len(T)]
+        follows: np.ndarray = np.asarray(_follows(T[rows], q7[rows], motion))[: len(T)]
         wrist = q7[np.arange(len(T)), follows.argmax(axis=1)]
         opening = np.full(len(T), gripper.max_opening, np.float32)
-        able = follows.any(axis=1)
-        return able, self._tried(target, pose, retrieve_action(T, wrist, opening), able)
+        able = np.asarray(follows.any(axis=1))
+        actions = retrieve_action(*map(jnp.asarray, (T, wrist, opening)))
+        return able, self._tried(target, pose, actions, able)
 
     def _tried(
         self, target: Target, pose: Float[np.ndarray, " 3"], actions: Action, wanted: Bool[np.ndarray, " k"]
     ) -> list[int]:
         """Results of the wanted actions in order, up to the first that succeeds."""
         cell = Cell(target, self.settings.workcell.shelf, self.settings.workcell.gripper)
-        objects, one = jax.tree.map(lambda a: np.asarray(a)[None], empty(TARGET)), np.ones(1, np.float32)
-        scenes = TrialScenes(objects, pose[None], np.ones(1, bool), one, one)
+        objects, one = jax.tree.map(lambda a: jnp.asarray(a)[None], empty(TARGET)), jnp.ones(1)
+        scenes = TrialScenes(objects, jnp.asarray(pose)[None], jnp.ones(1, bool), one, one)
         row = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(actions))
         results = self.trials.in_cell(cell, scenes, row, wanted[None])[0][wanted].tolist()
         end = results.index(TrialResult.SUCCEEDED) + 1 if TrialResult.SUCCEEDED in results else len(results)
