@@ -69,6 +69,14 @@ class TargetGrasps(flax.struct.PyTreeNode):
     target: Target
     config: GraspConfig = flax.struct.field(pytree_node=False)
 
+    def standing(self, pose: Float[Array, "3"]) -> Float[Array, "4 4"]:
+        """`T_world_target` of the target standing on the board at x, y [m] and yaw [rad].
+
+        Of one that looks alike at every yaw, which may have spun, it has yaw 0: its grasps are known about +x alone.
+        """
+        pose = pose.at[2].set(0.0) if self.target.solid.round else pose
+        return upright_pose(pose, self.target.height(self.shelf))
+
 
 class FoundGrasps(flax.struct.PyTreeNode):
     """Feasibility of the F grasps of a found target, at any pose.
@@ -296,7 +304,7 @@ def _ranked(
       grasps, scene, pose, active: as in `best_grasp`.
       depths: amounts by which objects are shrunk [m]; hits of the shrunk objects rank before the number of hits.
     """
-    T_world_target = upright_pose(pose, grasps.target.height(grasps.shelf))
+    T_world_target = grasps.standing(pose)
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
 

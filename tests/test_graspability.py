@@ -7,7 +7,7 @@ import pytest
 from mechsearch_jax import graspability, planner
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.retrieval import best_grasp
+from mechsearch_jax.retrieval import best_grasp, target_grasps
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
@@ -132,3 +132,16 @@ def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is
     blocked = best_grasp(problem.target_grasps, wall, pose)
     assert not bool(blocked.success)
     assert int(blocked.hits) >= 1
+
+
+def test_a_round_target_that_has_spun_has_the_grasps_that_it_had(problem):
+    grasps, objects = problem.target_grasps, superquadric.empty(8)
+    assert problem.target.solid.round
+    still = best_grasp(grasps, objects, jnp.array([0.6, 0.05, 0.0]))
+    for yaw in (0.7, 1.6, -2.5):
+        spun = best_grasp(grasps, objects, jnp.array([0.6, 0.05, yaw]))
+        np.testing.assert_array_equal(spun.action.T_world_gripper, still.action.T_world_gripper)
+        assert bool(spun.success)
+    np.testing.assert_allclose(grasps.standing(jnp.array([0.6, 0.05, 1.0]))[:2, 3], [0.6, 0.05])
+    box = target_grasps(problem.shelf, problem.gripper, Target("box"), GraspConfig())
+    np.testing.assert_allclose(box.standing(jnp.array([0.6, 0.05, 0.5]))[0, 0], np.cos(0.5), atol=1e-6)

@@ -132,7 +132,7 @@ def _planned(
     grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"]
 ) -> tuple[Bool[Array, " f"], GraspChoice]:
     """Which grasps of a target are feasible at a pose, and those that are worth trying."""
-    found = found_grasps(grasps, upright_pose(pose, grasps.target.height(grasps.shelf)))
+    found = found_grasps(grasps, grasps.standing(pose))
     return found.feasible, worth_trying(grasps, scene, pose)
 
 

@@ -14,7 +14,7 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, 
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, transform, upright_pose
+from mechsearch_jax.geometry.transforms import compose, transform
 from mechsearch_jax.planner import Problem, paper
 from mechsearch_jax.retrieval import TargetGrasps, best_grasp, no_grasps, straight_hits, target_grasps
 from mechsearch_jax.robot.gripper import Gripper
@@ -96,8 +96,7 @@ def swept_free(
       active: if False, the result is False, and little is computed.
     """
     tables, shelf = grasps.tables, grasps.shelf
-    T_world_target = upright_pose(pose, grasps.target.height(shelf))
-
+    T_world_target = grasps.standing(pose)
     T_world_gripper = compose(T_world_target[None], tables.T_target_gripper)
 
     def touches(shelf, _, row):

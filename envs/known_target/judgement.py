@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.planner import Belief, PlanningPolicy, Problem, Sequences, initial_belief
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
@@ -73,7 +72,7 @@ def judge(problem: Problem, objective: Objective, weights: Weights, world: World
 def _certain_belief(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
     """The belief that holds the target's true pose as found."""
     pose = true_target_pose(world)
-    grasps = found_grasps(problem.target_grasps, upright_pose(pose, problem.target.height(problem.shelf)), active)
+    grasps = found_grasps(problem.target_grasps, problem.target_grasps.standing(pose), active)
     return initial_belief(problem).replace(found=jnp.array(True), found_pose=pose, grasps=grasps)
 
 

@@ -19,7 +19,6 @@ from mechsearch_jax.envs.camera.snapshot import objects_on_the_board, true_targe
 from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.recording.sampled import Sampled, sampled
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Problem, graspability_map, initial_belief, update_belief
@@ -83,8 +82,7 @@ def grasps_at(
     grasps: TargetGrasps, objects: Superquadrics, pose: Float[Array, "3"]
 ) -> tuple[Bool[Array, " f"], Bool[Array, "f n"]]:
     """Which grasps of a target at a pose arm and shelf allow, and which objects each of them hits on its whole way."""
-    T_world_target = upright_pose(pose, grasps.target.height(grasps.shelf))
-    found = found_grasps(grasps, T_world_target, jnp.array(True))
+    found = found_grasps(grasps, grasps.standing(pose), jnp.array(True))
     return found.feasible, found_hits(grasps, found, objects, jnp.array(True))
 
 

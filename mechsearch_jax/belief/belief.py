@@ -107,7 +107,7 @@ def update_belief(
     contradiction = ~jnp.any(both) & ~found
     exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, prior), both)
     pose = jnp.where(visible, observation.target_pose, belief.found_pose)
-    T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
+    T_world_target = problem.target_grasps.standing(pose)
     return Belief(
         exists=jnp.where(found, belief.exists, exists),
         found=found,
