@@ -74,7 +74,7 @@ class TargetGrasps(flax.struct.PyTreeNode):
 
         Of one that looks alike at every yaw, which may have spun, it has yaw 0: its grasps are known about +x alone.
         """
-        pose = pose.at[2].set(0.0) if self.target.solid.round else pose
+        pose = pose.at[2].set(0.0) if self.target.round else pose
         return upright_pose(pose, self.target.height(self.shelf))
 
 

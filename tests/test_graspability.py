@@ -136,7 +136,7 @@ def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is
 
 def test_a_round_target_that_has_spun_has_the_grasps_that_it_had(problem):
     grasps, objects = problem.target_grasps, superquadric.empty(8)
-    assert problem.target.solid.round
+    assert problem.target.round
     still = best_grasp(grasps, objects, jnp.array([0.6, 0.05, 0.0]))
     for yaw in (0.7, 1.6, -2.5):
         spun = best_grasp(grasps, objects, jnp.array([0.6, 0.05, yaw]))
