@@ -33,7 +33,7 @@ def assert_same(a, b):
 @pytest.mark.always
 def test_a_problem_read_from_disk_is_the_one_that_was_built(folder, problem, monkeypatch):
     assert_same(cache.cached_problem(), problem)
-    (file,) = folder.iterdir()
+    (file,) = folder.glob("problem-*.npz")
     monkeypatch.setattr(problems, "build_problem", refuse)
     assert_same(cache.cached_problem(), problem)
     with pytest.raises(AssertionError):
@@ -44,14 +44,14 @@ def test_a_problem_read_from_disk_is_the_one_that_was_built(folder, problem, mon
     monkeypatch.setattr(cache, "_source", lambda: "another")
     with pytest.raises(AssertionError):
         cache.cached_problem()
-    assert list(folder.iterdir()) == [file]
+    assert list(folder.glob("problem-*.npz")) == [file]
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "altered", "renamed"])
 def test_a_damaged_file_is_built_anew(folder, problem, monkeypatch, damage):
     monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
     cache.cached_problem()
-    (file,) = folder.iterdir()
+    (file,) = folder.glob("problem-*.npz")
     whole = file.read_bytes()
     if damage == "altered":
         with np.load(file) as saved:
