@@ -94,7 +94,8 @@ def test_a_camera_that_does_not_see_the_shelf_ends_it_with_one_line(tmp_path, mo
 
 def test_a_shelf_out_of_reach_ends_it_with_one_line(problem, tmp_path, monkeypatch):
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
-    nothing = problem.grasps.replace(pair_pose=jnp.zeros(0, jnp.int32), pair_grasp=jnp.zeros(0, jnp.int32))
+    none = jnp.zeros(0, jnp.int32)
+    nothing = problem.grasps.replace(pair_pose=none, pair_grasp=none, pair_valid=jnp.zeros(0, bool))
     monkeypatch.setattr(problems, "candidate_grasps", lambda *args, **kwargs: nothing)
     status, message = program(monkeypatch, "plan", *files_of_a_user(tmp_path))
     assert (status, message.strip()) == (2, f"mechsearch: {NOWHERE}")
