@@ -524,7 +524,7 @@ def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
     proposed = jax.jit(jax.vmap(lambda *row: policy(row[0], problem, *row[1:])))(keys, beliefs, seen)
     alternatives = proposed.alternatives
     results = MODEL(problem, scenes_of(beliefs, seen), *jax.device_get((alternatives.actions, alternatives.worth)))
-    mapped = jax.jit(jax.vmap(choose))(proposed, results)
+    mapped = jax.jit(jax.vmap(choose))(proposed, results, jnp.zeros(len(rows), bool))
     for i, (belief, observation) in enumerate(rows):
         alone = decide(policy, MODEL, keys[i], problem, belief, observation)
         assert int(alone.action.kind) == int(mapped.action.kind[i])
