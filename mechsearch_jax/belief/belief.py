@@ -20,7 +20,7 @@ from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import FoundGrasps, found_grasps, no_grasps
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.target_view import body_at
+from mechsearch_jax.workspace.target_view import body_at, main_body
 
 
 class Belief(flax.struct.PyTreeNode):
@@ -158,17 +158,15 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
 def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Superquadrics, Bool[Array, " n"]]:
     """The objects and, in one more slot, the target, which is absent until found; and which slot is the target's.
 
-    The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp. If it is a
-    compound, all are bodies of parts, but not in a program for a hidden target, in which it is always absent.
+    The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp. Among
+    objects without parts a compound is its largest part alone: an approximation, which only trials in physics make up
+    for. A program of bodies of four parts is twice as large, and takes several times as long.
     """
     T = belief.grasps.T_world_target
-    target = body_at(problem.target, T[:3, 3], T[:3, :3], belief.found)
-    if target.parts is not None and objects.parts is None and belief.grasps.feasible.shape[-1] == 0:
-        target = target.replace(parts=None)
-    if target.parts is not None:
-        objects = with_parts(objects, target.parts.capacity)
-    elif objects.parts is not None:
-        target = with_parts(target, objects.parts.capacity)
+    if objects.parts is None:
+        target = main_body(problem.target, T[:3, 3], T[:3, :3], belief.found)
+    else:
+        target = with_parts(body_at(problem.target, T[:3, 3], T[:3, :3], belief.found), objects.parts.capacity)
     everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), objects, target)
     return everything, jnp.arange(everything.capacity) == objects.capacity
 

@@ -13,7 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.workspace.target_view import main_body
 
 # How far beyond the outermost candidate poses a target may be pushed, in cells of their grid.
 BEYOND = 1.0
@@ -39,6 +41,11 @@ def candidate_of(problem: Problem, scene: Superquadrics, is_target: Bool[Array, 
     """Mask of the candidate pose nearest to the target of a scene; `is_target` marks the target's slot."""
     slot = jnp.argmax(is_target)
     position, rotation = scene.position[slot], scene.rotation[slot]
+    if problem.target.is_compound and scene.parts is None:
+        # The slot holds its largest part.
+        part = main_body(problem.target, jnp.zeros(3), jnp.eye(3), jnp.array(True))
+        rotation = matmul(rotation, part.rotation.T)
+        position = position - rotate(rotation, part.position)
     pose = jnp.stack([position[0], position[1], jnp.arctan2(rotation[1, 0], rotation[0, 0])])
     return jnp.arange(problem.poses.shape[0]) == nearest_candidate(problem.poses, pose, problem.target.turn)
 

@@ -147,11 +147,6 @@ def with_parts(scene: Superquadrics, parts: int = PARTS) -> Superquadrics:
     return scene.replace(parts=stacked.replace(valid=stacked.valid & only))
 
 
-def like_given(scene: Superquadrics, given: Superquadrics) -> Superquadrics:
-    """Bodies without the single parts that `with_parts` gave them, if they had none when they were given."""
-    return scene if given.parts is not None else scene.replace(parts=None)
-
-
 def bodies_of(
     parts: Superquadrics, position: Float[Array, "*batch 3"], rotation: Float[Array, "*batch 3 3"]
 ) -> Superquadrics:

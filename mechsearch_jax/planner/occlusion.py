@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.existence import occluders
-from mechsearch_jax.geometry.bodies import like_given
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.proposal import WeightedDraw
@@ -111,7 +110,7 @@ def plan_by_occlusion(rollout: Rollout, key: Array, objects: Superquadrics) -> D
     actions = actions.replace(kind=jnp.where(usable, actions.kind, ActionKind.NONE).astype(jnp.int32))
     nothing = no_sequences(rollout.config, objects)
     # Without the target's slot, the last.
-    after = like_given(jax.tree.map(lambda a: a[:, : objects.capacity], changes["scene"]), objects)
+    after = jax.tree.map(lambda a: a[:, : objects.capacity], changes["scene"])
     sequences = nothing.replace(
         actions=jax.tree.map(lambda a, b: b.at[:, 0].set(a), actions, nothing.actions),
         cost=nothing.cost.at[:, 0].set(occludes.total + jnp.where(usable, value, 0.0)),

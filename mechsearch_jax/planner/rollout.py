@@ -24,7 +24,6 @@ from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.belief.moved_target import candidate_of
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.existence import existence, no_views, object_views
-from mechsearch_jax.geometry.bodies import like_given
 from mechsearch_jax.geometry.masked import on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
@@ -281,7 +280,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
     value, length = sequence_values(cost, penalty * cost[:, :-1], actions.kind != ActionKind.NONE, config.gamma)
     # Without the target's slot, the last.
-    after = like_given(jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes), objects)
+    after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)
     order = jnp.argsort(sequences.value, stable=True)
     sequences = jax.tree.map(lambda a: a[order], sequences)

@@ -21,7 +21,6 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.config.config import PlannerConfig
-from mechsearch_jax.geometry.bodies import like_given
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
@@ -144,7 +143,7 @@ def _decision(rollout: Rollout, begin: Node, result: Any, objects: Superquadrics
     children = functools.partial(jax.tree.map, lambda a: a[0, jnp.maximum(child, 0)])
     node = tree.embeddings
     actions, cost, slots = children(node.action), children(node.cost), objects.capacity
-    scenes = like_given(children(node.state.scene), objects)
+    scenes = children(node.state.scene)
     acted = (child >= 0) & (actions.kind != ActionKind.NONE)
     value = jnp.where(acted, -tree.qvalues(jnp.full(1, tree.ROOT_INDEX))[0], jnp.inf)
     actions = actions.replace(kind=jnp.where(acted, actions.kind, ActionKind.NONE).astype(jnp.int32))
@@ -154,7 +153,7 @@ def _decision(rollout: Rollout, begin: Node, result: Any, objects: Superquadrics
     actions, cost, value, scenes = jax.tree.map(lambda a: a[order], (actions, cost, value, scenes))
 
     # In the shapes of sampled sequences: one action each, and fewer of them.
-    present = like_given(jax.tree.map(lambda a: a[:slots], begin.state.scene), objects)
+    present = jax.tree.map(lambda a: a[:slots], begin.state.scene)
     nothing, count = no_sequences(config, present), width(config)
     sequences = nothing.replace(
         actions=jax.tree.map(lambda a, b: b.at[:count, 0].set(a), actions, nothing.actions),
