@@ -110,13 +110,14 @@ class Painter:
         self, step: RecordedStep, frame: Frame, before: RecordedStep | None, blockers: Collection[int]
     ) -> Picture:
         """f and g from above, what changed since the step before, the objects, the target's true pose, the action."""
-        lies = self._lies(step.world)
+        lost, lies = self._lost(step.world), self._lies(step.world)
 
         def draw(axes: Axes) -> None:
-            if lies:
+            if lost:
                 drawing.draw_shelf(axes, self._shelf)
                 drawing.draw_objects(axes, step.scene)
-                draw_lying(axes, step.world)
+                if lies:
+                    draw_lying(axes, step.world)
                 return
             self._map(axes, step, step.existence, step.graspability, step.scene)
             if before is not None and not (step.found or before.found):
@@ -159,7 +160,7 @@ class Painter:
         episode, alike = self._recording.episode, self._target.solid.ends_alike
         upright = target_trouble(self._shelf, position, rotation, alike) is None
         taken = episode is not None and episode.retrieved
-        stands, lies = upright and not taken, self._lies(world) and not taken
+        stands, lies = upright and not taken, self._lies(world)
         pose = np.asarray(true_target_pose(jax.tree.map(jnp.asarray, world))) if stands else None
         blockers = tuple(i for i in blocking if scene.valid[i])
         image = Snapshot(self._camera, self._shelf, jax.tree.map(jnp.asarray, world)).image
@@ -184,11 +185,17 @@ class Painter:
         shows = bool((owner == TARGET).any())
         return End(self._view(seen), self._above(above), stands, lies, shows, blockers)
 
-    def _lies(self, world: World) -> bool:
-        """Whether the target lies on the board."""
+    def _lost(self, world: World) -> bool:
+        """Whether the target lies, or has left the board, without being taken out."""
+        if self._recording.episode is not None and self._recording.episode.retrieved:
+            return False
         position, rotation = (np.asarray(a)[TARGET] for a in (world.position, world.rotation))
-        on = position[0] >= self._shelf.front and position[2] >= self._shelf.board
-        return bool(on) and target_trouble(self._shelf, position, rotation, self._target.solid.ends_alike) is not None
+        return target_trouble(self._shelf, position, rotation, self._target.solid.ends_alike) is not None
+
+    def _lies(self, world: World) -> bool:
+        """Whether it lies on the board."""
+        x, _, z = np.asarray(world.position)[TARGET]
+        return self._lost(world) and bool(x >= self._shelf.front and z >= self._shelf.board)
 
     def _map(
         self,

@@ -92,7 +92,8 @@ class Shape(NamedTuple):
 
 def over(recording: Recording, step: RecordedStep) -> str:
     """That the target could no longer be taken out when the robot looked; empty if it could."""
-    why = trouble(recording, step)
+    taken = recording.episode is not None and recording.episode.retrieved
+    why = None if taken else trouble(recording, step)
     return "" if why is None else f"The episode had ended: {why}."
 
 
@@ -160,6 +161,13 @@ def candidates(step: RecordedStep, obstacles: Sequence[int] = ()) -> list[Candid
             role = f"best of object {i}, in the way at the end{_ruled_out(step, best[0])}"
             shown.append(_candidate(step, role, best[0]))
     return shown
+
+
+def unmoved(step: RecordedStep, obstacles: Sequence[int]) -> str:
+    """That no candidate was to move the object that is in the way at the end; empty if one was."""
+    if not obstacles or not len(step.sampled) or (step.sampled.action.object == obstacles[0]).any():
+        return ""
+    return f"No candidate of this step was to move object {obstacles[0]}, which is in the way at the end."
 
 
 def _alike(one: Candidate, other: Candidate) -> bool:
