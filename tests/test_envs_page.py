@@ -481,9 +481,9 @@ def test_where_no_candidate_promises_anything_the_card_says_so():
         last = dataclasses.replace(STEPS[1], sampled=flat, evidence=evidence(found=True))
         return ending(dataclasses.replace(LOST, steps=(STEPS[0], last))).words
 
-    said = "None of the 2 candidate actions since it was seen was expected to lower J. 2 of them were to move object 0."
+    said = "No candidate action since it was seen was expected to lower J. 2 of these 2 were to move object 0."
     assert said in of(-0.01)
-    said = "None of"
+    said = "No candidate action"
     assert said not in of(-1.0)
     # A policy that minds no cost.
     assert said not in of(0.0, 0.0)

@@ -63,14 +63,14 @@ def course(*costs, **changes):
 def test_the_direct_cause_comes_first():
     first = record(PUSH, failure="dropped", target_fallen=True)
     fell = ending(of(STEPS, (first, EPISODE.steps[1]), failure="the target fell over"))
-    assert fell.sentences[0].endswith("to the left”: the object slipped out of the hand.")
+    assert fell.sentences[0].endswith("to the left”: object 0 slipped out of the hand.")
     assert [p.label for p in fell.story] == ["Believed", "Done", "Failed because"]
     assert (fell.decisive, fell.believing) == (0, 0)
     failed = fell.story[-1].text
     assert failed.startswith("In its trial that had not happened: it went as intended")
     assert re.search(r"The target was hidden then, its middle \d+ cm from that of object 0, and a trial knows", failed)
     last = (record(PUSH, failure="dropped"), EPISODE.steps[1])
-    assert ending(of(STEPS, last, failure="dropped")).sentences[0].endswith(": the object slipped out of the hand.")
+    assert ending(of(STEPS, last, failure="dropped")).sentences[0].endswith("”: object 0 slipped out of the hand.")
 
 
 def test_what_was_believed_is_said_wherever_the_target_was_found():
@@ -152,12 +152,13 @@ def test_why_what_is_in_the_way_was_not_moved_is_said():
     assert nothing.startswith(
         "1 of the 2 candidate actions was to move object 2, none of which was expected to lower J."
     )
+    tried = TriedActions(stacked(PUSH.replace(object=np.int32(2))), np.array([TrialResult.HARMFUL], np.int32))
+    others = promised(sampled((0, -9.0), (2, 0.0)), tried=tried)
+    assert "(1 refused after trials), none of the others was expected to lower J." in others
     less = promised(sampled((0, -9.0), (2, -2.0)))
-    assert "; the best was expected to lower J by 2.0 (at step 1, the chosen action by 9.0)." in less
+    assert "; the best was expected to lower J by 2.0 (at step 1, where 9.0 was expected of the chosen action)." in less
     late = promised(sampled((0, -9.0), (2, 3.0)), sampled((2, -4.0), (0, -3.0)))
-    assert (
-        "; none before action 2 was expected to lower J; the best was expected to lower it by 4.0 (action 2)." in late
-    )
+    assert ", and none before action 2 was expected to lower J; the best, by 4.0, was action 2." in late
     assert late.endswith("Action 2 was to move object 2, and it stayed where it was.")
 
 
@@ -185,8 +186,8 @@ def test_what_an_action_moved_along_is_not_hidden():
         (first, hidden(STEPS[1], world=world.replace(position=position))), failure="not found", found_step=None
     )
     assert "The only action was not to move object 0; action 1 moved it along, by 1.5 cm." in reasons(recording, [0])
-    assert moved_in_words(recording, 0) == "object 0 by 1 cm"
-    assert came_of_it(recording, 0) == "In the run it moved object 0 by 1 cm."
+    assert moved_in_words(recording, 0) == "object 0 by 2 cm"
+    assert came_of_it(recording, 0) == "In the run it moved object 0 by 2 cm."
     assert came_of_it(LOST, 0) == "In the run it moved nothing by more than 1 cm."
     assert came_of_it(RECORDING, 0) == ""
 
@@ -212,7 +213,7 @@ def test_an_action_that_tips_something_is_not_only_said_to_have_gone_as_intended
     rotation, position = np.array(world.rotation), np.array(world.position)
     rotation[0], position[0, 1] = QUARTER @ rotation[0], position[0, 1] + 0.06
     tips = of((STEPS[0], dataclasses.replace(STEPS[1], world=world.replace(rotation=rotation, position=position))))
-    said = "In the run it moved object 0 by 6 cm, and tipped object 0. Its trial went as intended; it does not matter there"
+    said = "In the run it moved object 0 by 6 cm, and tipped object 0. Its trial went as intended; it does not matter"
     assert said in words(page(tips))
     assert list(ending(tips).remarks) == ["In the run, action 1 tipped object 0."]
     assert 'class="odd"' in page(tips)

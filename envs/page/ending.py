@@ -17,6 +17,7 @@ from mechsearch_jax.envs.page.facts import (
     executed_words,
     free,
     hiding,
+    moves,
     plain,
     takes_target,
     tipped,
@@ -133,14 +134,19 @@ def _what_happened(recording: Recording, episode: Episode, acts: list[int], obst
         return f"The episode ended: {failure or 'nothing says why'}."
     words, record = f"action {fatal + 1}, “{executed_words(recording, fatal)}”", episode.steps[fatal]
     fallen, more = record.fallen or (), _moved_meanwhile(recording, fatal)
-    cause = f": {plain(record.failure)}" if record.failure and not takes_target(recording.steps[fatal]) else ""
+    acted, cause = recording.steps[fatal].action, ""
+    if record.failure and acted is not None and moves(acted):
+        # The target may be pushed, too.
+        k = int(acted.object)
+        thing = f"object {k}" if k < TARGET else "the object"
+        cause = f": {plain(record.failure).replace('the object', thing)}"
     if failure.startswith("retrieval: ") and not fallen:
         return f"The target was to be taken out by action {fatal + 1}, but {plain(failure)}.{more}"
     if fallen:
         return f"{objects_in_words(fallen).capitalize()} fell off the board at {words}{cause}.{more}"
     if "the target fell" in failure:
         return f"{failure.capitalize()} at {words}{cause}.{more}"
-    return f"The episode ended after {words}: {plain(failure)}."
+    return f"The episode ended after {words}{cause or f': {plain(failure)}'}."
 
 
 def _undetected(recording: Recording) -> str:

@@ -49,7 +49,10 @@ def reasons(recording: Recording, objects: Sequence[int]) -> list[str]:
     every = f"the {total} candidate actions{when}" if total > 1 else f"the only candidate action{when}"
     sentences, hopeless = [], last.found and _hopeless([recording.steps[i] for i in since])
     if hopeless:
-        sentences, every = [f"None of {every} was expected to lower J."], "them"
+        refused = any(r for i in since for _, r in _candidates(recording.steps[i]))
+        left = " that trials left" if refused else ""
+        sentences = [f"No candidate action{when}{left} was expected to lower J."]
+        every = f"all {total}" if refused else f"these {total}"
     for i in objects:
         sentences += [_considered(recording, since, i, every, not hopeless), _trials(recording, since, i)]
         every = "them"
@@ -84,7 +87,7 @@ def _considered(recording: Recording, since: Sequence[int], k: int, every: str, 
     remarks = [f"{refused} refused after trials"] if refused else []
     remarks += _when_none([i for i in since if rows[i]], list(of_it))
     remarked = f" ({', '.join(remarks)})" if remarks else ""
-    promise = _promised(recording, since, k) if promised else ""
+    promise = _promised(recording, since, k, "the others" if refused else "which") if promised else ""
     return f"{count} of {every} {'was' if count == 1 else 'were'} {to}{remarked}{promise}."
 
 
@@ -100,36 +103,38 @@ def _when_none(every: list[int], of_it: list[int]) -> list[str]:
     return [*words, f"none from action {later[0] + 1} on"] if later else words
 
 
-def _promised(recording: Recording, since: Sequence[int], k: int) -> str:
-    """What the best candidates for an object were expected to change J by, beside what was chosen; may be empty."""
+def _promised(recording: Recording, since: Sequence[int], k: int, them: str) -> str:
+    """What the best candidates for an object were expected to change J by, beside what was chosen; may be empty.
+
+    Args:
+      recording: of the episode.
+      since: the steps that count.
+      k: the object.
+      them: the candidates of which that is recorded, in words.
+    """
     best = {}
     for i in since:
         kept = recording.steps[i].sampled
-        of_it = kept.value[kept.action.object == k] if kept.cost.any() else []
-        if len(of_it):
+        of_it = kept.value[kept.action.object == k]
+        if len(of_it) and kept.cost.any():
             best[i] = float(of_it.min())
     if not best:
         return ""
     i = min(best, key=lambda i: best[i])
     if best[i] > LEAST_GAIN:
-        return f", each of which was expected to raise J, by at least {number(best[i])}"
+        return f", each of {them} was expected to raise J, by at least {number(best[i])}"
     promising = [j for j in best if best[j] < -LEAST_GAIN]
     if not promising:
-        return ", none of which was expected to lower J"
-    late = (
-        f"; none before action {promising[0] + 1} was expected to lower J" if promising[0] != next(iter(best)) else ""
-    )
-    step = recording.steps[i]
+        return f", none of {them} was expected to lower J"
+    early, step = promising[0] == next(iter(best)), recording.steps[i]
     chosen = [float(v) for row, v in enumerate(step.sampled.value) if same_action(step, step.sampled.action, row)]
-    words = (
-        f"{late}; the best was expected to lower it by {number(-best[i])}"
-        if late
-        else (f"; the best was expected to lower J by {number(-best[i])}")
-    )
+    words = f"; the best was expected to lower J by {number(-best[i])}"
+    if not early:
+        words = f", and none before action {promising[0] + 1} was expected to lower J; the best, by {number(-best[i])}"
     if _moves_object(step, k) and chosen and chosen[0] <= best[i]:
-        return f"{words} (action {i + 1})"
-    there = f", the chosen action by {number(max(-chosen[0], 0.0))}" if chosen else ""
-    return f"{words} (at step {i + 1}{there})"
+        return f"{words} (action {i + 1})" if early else f"{words}, was action {i + 1}"
+    there = f", where {number(max(-chosen[0], 0.0))} was expected of the chosen action" if chosen else ""
+    return f"{words} (at step {i + 1}{there})" if early else f"{words}, came at step {i + 1}{there}"
 
 
 def _trials(recording: Recording, since: Sequence[int], k: int) -> str:
