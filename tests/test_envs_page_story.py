@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.page.ending import ending
 from mechsearch_jax.envs.page.page import page
 from mechsearch_jax.envs.page.reasons import moved_in_words, reasons
-from mechsearch_jax.envs.page.steps import came_of_it, candidates, label, over, unmoved
+from mechsearch_jax.envs.page.steps import came_of_it, candidates, label, over, troubles, unmoved
 from mechsearch_jax.envs.page.story import came_into_view, idle, stalled
 from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.world.world import TARGET
@@ -63,7 +63,7 @@ def course(*costs, **changes):
 def test_the_direct_cause_comes_first():
     first = record(PUSH, failure="dropped", target_fallen=True)
     fell = ending(of(STEPS, (first, EPISODE.steps[1]), failure="the target fell over"))
-    assert fell.sentences[0].endswith("to the left”: object 0 slipped out of the hand.")
+    assert fell.sentences[0].endswith("to the left”, before it was seen: object 0 slipped out of the hand.")
     assert [p.label for p in fell.story] == ["Believed", "Done", "Failed because"]
     assert (fell.decisive, fell.believing) == (0, 0)
     failed = fell.story[-1].text
@@ -172,7 +172,8 @@ def test_trials_that_stood_against_moving_it_are_counted():
     why = "(held up, out of reach, or out of the hand)"
     assert f"The only trial of moving object 2 failed {why}." in of_results(failed)
     assert f"All 2 trials of moving object 2 failed {why}." in of_results(failed, failed)
-    assert f"Of 3 trials of moving object 2 1 failed {why} and 1 did harm" in of_results(failed, harmful, good)
+    assert f"Of 3 trials of moving object 2, 1 failed {why} and 1 did harm" in of_results(failed, harmful, good)
+    assert f"1 of the 2 trials of moving object 2 failed {why}." in of_results(failed, good)
     assert "trial" not in of_results(good)
 
 
@@ -228,6 +229,10 @@ def test_after_a_fall_no_grasps_are_counted():
     fell = of((STEPS[0], last), records, failure="the target fell over")
     assert over(fell, last) == "The episode had ended: the target fell over."
     assert over(fell, STEPS[0]) == ""
+    assert troubles(fell, 0) == ["the target fell off the board"]
+    tipped = of(fell.steps, failure="the target fell over")
+    assert troubles(tipped, 0) == ["the target fell over"]
+    assert troubles(LOST, 0) == troubles(RECORDING, 0) == []
     section = page(fell).split('<section class="step"')[2]
     assert "The episode had ended" in words(section)
     assert "inside the shelf" not in words(section)

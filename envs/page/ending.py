@@ -145,7 +145,8 @@ def _what_happened(recording: Recording, episode: Episode, acts: list[int], obst
     if fallen:
         return f"{objects_in_words(fallen).capitalize()} fell off the board at {words}{cause}.{more}"
     if "the target fell" in failure:
-        return f"{failure.capitalize()} at {words}{cause}.{more}"
+        unseen = "" if any(step.found for step in recording.steps[: fatal + 1]) else ", before it was seen"
+        return f"{failure.capitalize()} at {words}{unseen}{cause}.{more}"
     return f"The episode ended after {words}{cause or f': {plain(failure)}'}."
 
 

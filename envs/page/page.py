@@ -245,7 +245,7 @@ def step_words(recording: Recording, i: int, frame: Frame, obstacles: Sequence[i
         "shapes": shapes,
         "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,
         "costs": texts.costs(recording, i),
-        "troubles": texts.troubles(record),
+        "troubles": texts.troubles(recording, i),
         "came_of_it": texts.came_of_it(recording, i),
     }
 

@@ -154,7 +154,10 @@ def _trials(recording: Recording, since: Sequence[int], k: int) -> str:
         return f"The only trial of moving object {k} {ends[0][1]}."
     if ends[0][0] == len(results):
         return f"All {len(results)} trials of moving object {k} {ends[0][1]}."
-    return f"Of {len(results)} trials of moving object {k} {' and '.join(f'{count} {end}' for count, end in ends)}."
+    counts = " and ".join(f"{count} {end}" for count, end in ends)
+    if len(ends) > 1:
+        return f"Of {len(results)} trials of moving object {k}, {counts}."
+    return f"{ends[0][0]} of the {len(results)} trials of moving object {k} {ends[0][1]}."
 
 
 def _carried_out(recording: Recording, since: Sequence[int], k: int) -> str:

@@ -252,9 +252,13 @@ def blocked(step: RecordedStep) -> tuple[int, ...]:
     return tuple(i for i in blocking(step.evidence.hits) if step.scene.valid[i])
 
 
-def troubles(record: Step | None) -> list[str]:
-    """What went wrong at a step."""
-    return [] if record is None else [*([plain(record.failure)] if record.failure else []), *events(record)]
+def troubles(recording: Recording, i: int) -> list[str]:
+    """What went wrong at a step; empty where that is not recorded."""
+    if recording.episode is None:
+        return []
+    record, after = recording.episode.steps[i], [] if recording.episode.retrieved else recording.steps[i + 1 : i + 2]
+    fell = [why for step in after if (why := trouble(recording, step)) and not record.target_fallen]
+    return [*([plain(record.failure)] if record.failure else []), *events(record), *fell]
 
 
 def came_of_it(recording: Recording, i: int) -> str:
