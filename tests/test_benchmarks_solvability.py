@@ -202,7 +202,7 @@ def test_reasons_say_what_is_in_the_way_and_what_could_be_done_to_it():
         "Arm and shelf allow no grasp of the target, nor of one that was pushed"
     )
     stuck = reason(result_of(judgement([1], [0, 1])))
-    assert "each of the 2 grasps that arm and shelf allow hits object 1." in stuck
+    assert "each of the 2 grasps that the arm can reach inside the shelf hits object 1." in stuck
     assert "No action brought it nearer" in stuck
     assert "Object 1 could be neither picked nor pushed." in stuck
     better = reason(

@@ -31,13 +31,20 @@ def blocking(hits: Bool[np.ndarray, "grasps n"]) -> tuple[int, ...]:
 def grasps_in_words(hits: Bool[np.ndarray, "grasps n"]) -> str:
     """What the grasps that arm and shelf allow meet."""
     if not len(hits):
-        return "arm and shelf allow no grasp of the target"
+        return "the arm can reach no grasp of the target inside the shelf"
     sets = least_sets(hits)
     listed = ", or ".join(map(objects_in_words, sets[:MAX_LISTED])) + (", or others" if len(sets) > MAX_LISTED else "")
-    return f"each of the {len(hits)} grasps that arm and shelf allow hits {listed}"
+    if len(hits) == 1:
+        return f"the only grasp that the arm can reach inside the shelf hits {listed}"
+    return f"each of the {len(hits)} grasps that the arm can reach inside the shelf hits {listed}"
 
 
 def objects_in_words(indices: Sequence[int]) -> str:
     """Objects by their numbers."""
+    return f"object{'s' if len(indices) > 1 else ''} {numbers_in_words(indices)}"
+
+
+def numbers_in_words(indices: Sequence[int]) -> str:
+    """Numbers as in a sentence."""
     *others, last = map(str, indices)
-    return f"objects {', '.join(others)} and {last}" if others else f"object {last}"
+    return f"{', '.join(others)} and {last}" if others else last

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import os
 import urllib.parse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ import jinja2
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.episode.records import load_episode
 from mechsearch_jax.envs.page import steps as texts
-from mechsearch_jax.envs.page.ending import action_words, ending, executed_words, takes_target, target_is_out
+from mechsearch_jax.envs.page.ending import Ending, ending
+from mechsearch_jax.envs.page.facts import action_words, executed_words, takes_target, target_is_out, tipped
 from mechsearch_jax.envs.page.pictures import Painter, changed_cells, data_uri, tried_grasp
+from mechsearch_jax.envs.page.story import idle
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
@@ -28,7 +30,7 @@ from mechsearch_jax.viz.filmstrip import Frame
 _TEMPLATE = Path(__file__).with_name("page.html.jinja")
 RECORD = "episode.json"
 # Options of an episode that its card names.
-_FACTS = ("policy", "recognition", "rehearsal", "seed")
+_FACTS = {"policy": "policy", "recognition": "recognition", "rehearsal": "trials", "seed": "seed"}
 
 
 def check_page_path(path: Path) -> None:
@@ -82,13 +84,14 @@ def page(recording: Recording, film: str = "") -> str:
     """
     template = environment().get_template(_TEMPLATE.name)
     painter = Painter(recording)
-    shown = [_step(recording, i, painter) for i in range(len(recording.steps))]
+    end = ending(recording)
+    shown = [_step(recording, i, painter, end.obstacles) for i in range(len(recording.steps))]
     return template.render(
         film=urllib.parse.quote(film),
         moves=not film.lower().endswith(".webp"),
         title=recording.heading.partition(":")[0] or "an episode",
         stamp=stamp(),
-        card=_card(recording, painter),
+        card=_card(recording, painter, end),
         steps=shown,
         bands=[(band.colour, band.label) for band in drawing.bands()],
         colours={name: getattr(drawing, name) for name in ("TARGET", "ACTION", "OBJECT")},
@@ -113,28 +116,44 @@ def stamp() -> str:
     return hashlib.sha256("\0".join(source.read_text(encoding="utf-8") for source in sources).encode()).hexdigest()[:16]
 
 
-def _card(recording: Recording, painter: Painter) -> dict[str, Any]:
-    end = ending(recording)
+def _card(recording: Recording, painter: Painter, end: Ending) -> dict[str, Any]:
     last = painter.end(end.blockers)
     return {
         **end._asdict(),
+        "decisive": end.decisive or 0,
         "stands": last.stands,
+        "lies": last.lies,
         "grasp": last.stands and tried_grasp(recording.steps[-1]) is not None,
         "shows": last.shows,
         "fate": "outside the shelf" if target_is_out(recording) else "which no longer stands",
         "taken": recording.episode is not None and bool(recording.episode.retrieved),
-        "facts": _facts(recording),
+        "facts": _facts(recording, bool(end.good)),
         "seen": data_uri(last.seen),
         "above": data_uri(last.above),
         "blockers": last.blockers,
+        "belief": _belief(recording, painter, end),
     }
 
 
-def _facts(recording: Recording) -> list[tuple[str, str]]:
+def _belief(recording: Recording, painter: Painter, end: Ending) -> dict[str, Any] | None:
+    """The map of what was believed where it mattered to a loss; None without one."""
+    if end.believing is None:
+        return None
+    step = recording.steps[end.believing]
+    frame = recorded_frame(step, recording.camera, recording.shelf)
+    return {
+        "step": end.believing + 1,
+        "acts": step.action is not None,
+        "found": step.found,
+        "map": data_uri(painter.believed(step, frame, None, texts.blocked(step))),
+    }
+
+
+def _facts(recording: Recording, good: bool) -> list[tuple[str, str]]:
     episode = recording.episode
     if episode is None:
         return []
-    facts = [(name, str(episode.config[name])) for name in _FACTS if name in episode.config]
+    facts = [(label, str(episode.config[name])) for name, label in _FACTS.items() if name in episode.config]
     differs = [f"{name.partition('.')[2]} {value}" for name, value in episode.config.items() if "mismatch." in name]
     facts += [("world differs", ", ".join(differs))] if differs else []
     kinds = [step.action.kind for step in episode.steps if step.action is not None]
@@ -147,7 +166,7 @@ def _facts(recording: Recording) -> list[tuple[str, str]]:
         for step in episode.steps
         if step.cost is not None and step.predicted_cost is not None and step.observed_cost is not None
     ]
-    if gains:
+    if gains and good:
         promised, came = (round(sum(column)) for column in zip(*gains, strict=True))
         # A policy may mind no cost.
         facts += [("J was to fall by", f"{promised} in all, and fell by {came}")] if promised or came else []
@@ -167,11 +186,11 @@ def left_out(recording: Recording) -> list[str]:
     return sentences
 
 
-def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
+def _step(recording: Recording, i: int, painter: Painter, obstacles: Sequence[int]) -> dict[str, Any]:
     """What the page shows of a step, by the template's names."""
     step, before = recording.steps[i], recording.steps[i - 1] if i else None
     frame = recorded_frame(step, recording.camera, recording.shelf)
-    words = step_words(recording, i, frame)
+    words = step_words(recording, i, frame, obstacles)
     pictures = [data_uri(painter.foreseen(step, candidate.row)) for candidate in words["candidates"]]
     return {
         **words,
@@ -183,6 +202,10 @@ def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
             for candidate, picture in zip(words["candidates"], pictures, strict=True)
         ],
         "sampled": len(step.sampled),
+        "label": texts.label(step),
+        "came": step.found and i > 0 and before is not None and not before.found,
+        "idle": idle(recording, i),
+        "odd": bool(tipped(recording, i) or (words["costs"] and words["costs"][1])),
         "retrieves": takes_target(step),
         "grasp": tried_grasp(step) is not None,
         **_changes(recording, i),
@@ -191,18 +214,19 @@ def _step(recording: Recording, i: int, painter: Painter) -> dict[str, Any]:
     }
 
 
-def step_words(recording: Recording, i: int, frame: Frame) -> dict[str, Any]:
+def step_words(recording: Recording, i: int, frame: Frame, obstacles: Sequence[int] = ()) -> dict[str, Any]:
     """What is said of a step, by the names of the templates.
 
     Args:
       recording: of the episode.
       i: index of the step.
       frame: its picture.
+      obstacles: the objects in the way of a lost target at the end.
     """
     step, before = recording.steps[i], recording.steps[i - 1] if i else None
     record = None if recording.episode is None else recording.episode.steps[i]
     shapes = texts.shapes(recording, step, frame.owner)
-    executed = executed_words(recording, i)
+    executed, over = executed_words(recording, i), texts.over(recording, step)
     return {
         "number": i + 1,
         "heading": texts.heading(step),
@@ -210,15 +234,19 @@ def step_words(recording: Recording, i: int, frame: Frame) -> dict[str, Any]:
         "executed": "" if executed == action_words(step) else executed,
         "found": step.found,
         "blocked": bool(texts.blocked(step)),
-        "belief": texts.poses_in_words(step, before),
-        "truth": texts.truth(step, record),
-        "grasps": texts.grasps_words(step),
-        "candidates": texts.candidates(step),
+        "over": bool(over),
+        "lies": over.endswith("fell over."),
+        "belief": over or texts.poses_in_words(step, before),
+        "truth": "" if over else texts.truth(step, record),
+        "grasps": "" if over else texts.grasps_words(step),
+        "candidates": texts.candidates(step, obstacles),
+        "unmoved": texts.unmoved(step, obstacles),
         "trials": texts.trials(step),
         "shapes": shapes,
         "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,
         "costs": texts.costs(recording, i),
-        "troubles": texts.troubles(record),
+        "troubles": texts.troubles(recording, i),
+        "came_of_it": texts.came_of_it(recording, i),
     }
 
 

@@ -25,7 +25,7 @@ from mechsearch_jax.envs.recording.pictures import colour_image
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.recording.shown_decisions import sampled_sketch
-from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.envs.world.world import TARGET, World, superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.blockers import Moment, draw_seen_blockers, mark_from_above
@@ -51,6 +51,7 @@ class End(NamedTuple):
     Attributes:
       seen, above: in the camera's view and from above.
       stands: whether the target still stands on the board.
+      lies: whether it lies there.
       shows: whether the camera sees some of the target.
       blockers: the objects on the board that are marked as in its way.
     """
@@ -58,6 +59,7 @@ class End(NamedTuple):
     seen: Picture
     above: Picture
     stands: bool
+    lies: bool
     shows: bool
     blockers: tuple[int, ...]
 
@@ -108,8 +110,15 @@ class Painter:
         self, step: RecordedStep, frame: Frame, before: RecordedStep | None, blockers: Collection[int]
     ) -> Picture:
         """f and g from above, what changed since the step before, the objects, the target's true pose, the action."""
+        lost, lies = self._lost(step.world), self._lies(step.world)
 
         def draw(axes: Axes) -> None:
+            if lost:
+                drawing.draw_shelf(axes, self._shelf)
+                drawing.draw_objects(axes, step.scene)
+                if lies:
+                    draw_lying(axes, step.world)
+                return
             self._map(axes, step, step.existence, step.graspability, step.scene)
             if before is not None and not (step.found or before.found):
                 self._changes(axes, before.existence, step.existence)
@@ -150,7 +159,8 @@ class Painter:
         position, rotation = (np.asarray(a)[TARGET] for a in (world.position, world.rotation))
         episode, alike = self._recording.episode, self._target.solid.ends_alike
         upright = target_trouble(self._shelf, position, rotation, alike) is None
-        stands = upright and not (episode is not None and episode.retrieved)
+        taken = episode is not None and episode.retrieved
+        stands, lies = upright and not taken, self._lies(world)
         pose = np.asarray(true_target_pose(jax.tree.map(jnp.asarray, world))) if stands else None
         blockers = tuple(i for i in blocking if scene.valid[i])
         image = Snapshot(self._camera, self._shelf, jax.tree.map(jnp.asarray, world)).image
@@ -168,9 +178,24 @@ class Painter:
             if pose is not None:
                 drawing.draw_target(axes, pose, self._target, certain=True)
                 _draw_tried_grasp(axes, self._recording.steps[-1])
+            if lies:
+                draw_lying(axes, world)
             mark_from_above(axes, scene, blockers)
 
-        return End(self._view(seen), self._above(above), stands, bool((owner == TARGET).any()), blockers)
+        shows = bool((owner == TARGET).any())
+        return End(self._view(seen), self._above(above), stands, lies, shows, blockers)
+
+    def _lost(self, world: World) -> bool:
+        """Whether the target lies, or has left the board, without being taken out."""
+        if self._recording.episode is not None and self._recording.episode.retrieved:
+            return False
+        position, rotation = (np.asarray(a)[TARGET] for a in (world.position, world.rotation))
+        return target_trouble(self._shelf, position, rotation, self._target.solid.ends_alike) is not None
+
+    def _lies(self, world: World) -> bool:
+        """Whether it lies on the board."""
+        x, _, z = np.asarray(world.position)[TARGET]
+        return self._lost(world) and bool(x >= self._shelf.front and z >= self._shelf.board)
 
     def _map(
         self,
@@ -201,6 +226,17 @@ class Painter:
 
     def _above(self, draw: Callable[[Axes], None]) -> Picture:
         return _drawn(drawing.map_share(self._shelf), draw)
+
+
+def draw_lying(axes: Axes, world: World) -> None:
+    """Draw the target from above as it lies."""
+    bodies = jax.tree.map(np.asarray, superquadrics(jax.tree.map(jnp.asarray, world)))
+    outline = drawing.outlines(bodies.replace(valid=np.arange(len(bodies.valid)) == TARGET))[TARGET]
+    assert outline is not None
+    style = {"facecolor": drawing.TARGET, "edgecolor": drawing.TARGET, "linewidth": 1.6, "zorder": 5}
+    lying = patches.Polygon(outline[:, ::-1], closed=True, **style)
+    lying.set_path_effects(drawing.halo(1.6))
+    axes.add_patch(lying)
 
 
 def changed_cells(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,18 +13,23 @@ from jaxtyping import Float, Int
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode.records import Step
-from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words
-from mechsearch_jax.envs.page.ending import (
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, objects_in_words
+from mechsearch_jax.envs.page.facts import (
     action_words,
     believed_elsewhere,
     counted,
     free,
+    number,
     plain,
     same_action,
     takes_target,
+    tipped,
     trial_of,
+    trouble,
 )
 from mechsearch_jax.envs.page.pictures import objects_of
+from mechsearch_jax.envs.page.reasons import moved_in_words
+from mechsearch_jax.envs.page.story import WRONG
 from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.graspability import INFEASIBLE
@@ -44,8 +50,6 @@ UNKNOWN = "–"
 SEEING = ("masks", "masks-parts", "full", "full-parts")
 # An object that shows no more pixels than this counts as hidden.
 FEWEST_PIXELS = 100
-# A body that is recognised farther than this from where it is counts as wrong [m].
-WRONG = 0.02
 
 
 class Candidate(NamedTuple):
@@ -86,6 +90,13 @@ class Shape(NamedTuple):
     wrong: bool
 
 
+def over(recording: Recording, step: RecordedStep) -> str:
+    """That the target could no longer be taken out when the robot looked; empty if it could."""
+    taken = recording.episode is not None and recording.episode.retrieved
+    why = None if taken else trouble(recording, step)
+    return "" if why is None else f"The episode had ended: {why}."
+
+
 def poses_in_words(step: RecordedStep, before: RecordedStep | None) -> str:
     """f and g of a step, and how f changed since the step before."""
     if step.found:
@@ -116,15 +127,21 @@ def grasps_words(step: RecordedStep) -> str:
     hits = step.evidence.hits
     if free(hits):
         clear = int((~hits.any(axis=1)).sum())
-        return f"{clear} of {len(hits)} grasps that arm and shelf allow hit{'s' if clear == 1 else ''} nothing."
-    return f"{grasps_in_words(hits)}.".capitalize()
+        reached = f"{clear} of {len(hits)} grasps that the arm can reach inside the shelf"
+        return f"{reached} hit{'s' if clear == 1 else ''} nothing."
+    words = grasps_in_words(hits)
+    return f"{words[0].upper()}{words[1:]}."
 
 
-def candidates(step: RecordedStep) -> list[Candidate]:
-    """The chosen action, the runner-up, and the best action that moves another object if the runner-up does not.
+def candidates(step: RecordedStep, obstacles: Sequence[int] = ()) -> list[Candidate]:
+    """The chosen action, the runner-up, and the best actions that move another object, or one in the way.
 
-    The last is left out of recordings that do not foresee it. None where nothing was chosen, or no sequences were
-    compared.
+    A runner-up that reads as the chosen action does is passed over. The best that moves another object is left out of
+    recordings that do not foresee it. None where nothing was chosen, or no sequences were compared.
+
+    Args:
+      step: with the decision.
+      obstacles: the objects in the way at the end; the best action of the first is shown, too.
     """
     if step.action is None or not kind_of(int(step.action.kind)).moves_object:
         return []
@@ -135,7 +152,27 @@ def candidates(step: RecordedStep) -> list[Candidate]:
     elsewhere = [k for k in every if moved[k] != step.action.object][:1]
     further = [k for k in elsewhere if k not in others and _forecast(step, k)]
     roles = {"chosen": chosen, "runner-up": others, "best of another object": further}
-    return [_candidate(step, role + _ruled_out(step, k), k) for role, rows in roles.items() for k in rows]
+    shown = [_candidate(step, role + _ruled_out(step, k), k) for role, rows in roles.items() for k in rows]
+    if len(shown) > 1 and chosen and others and _alike(shown[0], shown[1]):
+        del shown[1]
+    for i in obstacles[:1]:
+        best = [k for k in every if moved[k] == i][:1]
+        if best and i not in [int(moved[candidate.row]) for candidate in shown]:
+            role = f"best of object {i}, in the way at the end{_ruled_out(step, best[0])}"
+            shown.append(_candidate(step, role, best[0]))
+    return shown
+
+
+def unmoved(step: RecordedStep, obstacles: Sequence[int]) -> str:
+    """That no candidate was to move the object that is in the way at the end; empty if one was."""
+    if not obstacles or not len(step.sampled) or (step.sampled.action.object == obstacles[0]).any():
+        return ""
+    return f"No candidate of this step was to move object {obstacles[0]}, which is in the way at the end."
+
+
+def _alike(one: Candidate, other: Candidate) -> bool:
+    """Whether two candidates read the same."""
+    return one._replace(role="", row=0) == other._replace(role="", row=0)
 
 
 def _ruled_out(step: RecordedStep, k: int) -> str:
@@ -153,11 +190,6 @@ def _candidate(step: RecordedStep, role: str, k: int) -> Candidate:
     if not (step.sampled.value.any() or step.sampled.cost.any()):
         return Candidate(role, words, "", "", _forecast(step, k), k)
     return Candidate(role, words, f"{value + 0.0:+.1f}".replace("-0.0", "0.0"), number(cost), _forecast(step, k), k)
-
-
-def number(cost: float) -> str:
-    """A cost with as many digits as matter."""
-    return f"{cost:.0f}" if abs(cost) >= 20 else f"{cost:.1f}"
 
 
 def _forecast(step: RecordedStep, k: int) -> str:
@@ -220,9 +252,28 @@ def blocked(step: RecordedStep) -> tuple[int, ...]:
     return tuple(i for i in blocking(step.evidence.hits) if step.scene.valid[i])
 
 
-def troubles(record: Step | None) -> list[str]:
-    """What went wrong at a step."""
-    return [] if record is None else [*([plain(record.failure)] if record.failure else []), *events(record)]
+def troubles(recording: Recording, i: int) -> list[str]:
+    """What went wrong at a step; empty where that is not recorded."""
+    if recording.episode is None:
+        return []
+    record, after = recording.episode.steps[i], [] if recording.episode.retrieved else recording.steps[i + 1 : i + 2]
+    fell = [why for step in after if (why := trouble(recording, step)) and not record.target_fallen]
+    return [*([plain(record.failure)] if record.failure else []), *events(record), *fell]
+
+
+def came_of_it(recording: Recording, i: int) -> str:
+    """What a step's action moved and tipped in the run, beside its trial; empty if nothing, or without a record."""
+    step = recording.steps[i]
+    if recording.episode is None or step.action is None:
+        return ""
+    moved, tips = moved_in_words(recording, i, target=not takes_target(step)), tipped(recording, i)
+    if not moved:
+        return "In the run it moved nothing by more than 1 cm."
+    over = f", and tipped {objects_in_words(tips)}" if tips else ""
+    trial = trial_of(step, step.action)
+    fine = tips and trial is TrialResult.SUCCEEDED and not takes_target(step)
+    remark = " Its trial went as intended; it does not matter there whether an object is tipped." if fine else ""
+    return f"In the run it moved {moved}{over}.{remark}"
 
 
 def shapes(recording: Recording, step: RecordedStep, owner: Int[np.ndarray, "h w"]) -> list[Shape]:
@@ -279,7 +330,9 @@ def doubt(recording: Recording, step: RecordedStep, depth: np.ndarray) -> str:
     """How badly the recognised shapes explain an image without noise."""
     seen = Observation(step.scene, jnp.array(step.found), jnp.asarray(step.target_pose))
     measure = recognition_doubt(recording, seen, depth)
-    passed = f"; {100 * measure.passed:.0f} % of the rays to {measure.worst} pass through it" if measure.worst else ""
+    share = f"{100 * measure.passed:.0f} %"
+    behind = f"; at {share} of the pixels that {measure.worst} should fill, something behind it shows"
+    passed = behind if measure.worst and share != "0 %" else ""
     return f"{100 * measure.unexplained:.0f} % of what stands on the board lies on no recognised shape{passed}."
 
 
@@ -306,6 +359,17 @@ def costs(recording: Recording, i: int) -> tuple[str, bool] | None:
         observed += ", as a grasp that takes the target out is known then"
     worse = record.observed_cost is not None and record.observed_cost > record.predicted_cost + 0.1 * record.cost
     return f"J: {number(record.cost)} before, {number(record.predicted_cost)} expected, {observed}", worse
+
+
+def label(step: RecordedStep) -> str:
+    """What was done at a step, as short as can be."""
+    if step.action is None:
+        return "end"
+    kind = kind_of(int(step.action.kind))
+    if not kind.moves_object:
+        return "take out" if kind.takes_target else kind.name
+    what = "target" if int(step.action.object) == step.scene.capacity else str(int(step.action.object))
+    return f"{kind.name.partition('-')[0]} {what}"
 
 
 def heading(step: RecordedStep) -> str:

@@ -132,5 +132,5 @@ def _panel() -> Any:
     templates = environment()
     assert templates.loader is not None
     templates.loader = jinja2.ChoiceLoader([templates.loader, jinja2.FileSystemLoader(_TEMPLATE.parent)])
-    templates.globals |= {**COLOURS, "nothing": "Nothing was compared, and nothing was tried out."}
+    templates.globals |= {**COLOURS, "nothing": "Nothing was compared, and there were no trials."}
     return templates.get_template(_TEMPLATE.name).module

@@ -211,7 +211,7 @@ class Viewer:
         gui.add_html(legend())
         self._seen = gui.add_image(_NO_PICTURE, label="what the camera saw", jpeg_quality=QUALITY)
         self._sample = gui.add_dropdown("action", (CHOSEN,), visible=False)
-        with gui.add_folder("what was compared, tried out and recognised"):
+        with gui.add_folder("what was compared, trials, and what was recognised"):
             self._evidence = gui.add_html("")
             self._perceived = gui.add_image(
                 _NO_PICTURE, label="recognised shapes; orange: less than 80 % sure, red: less than 50 %",
