@@ -33,7 +33,7 @@ HEIGHTS, FROM_BOTTOM, FROM_TOP, DEPTH, ALONG = 7, 0.012, 0.005, 0.004, 0.001
 PAD, PAD_FRONT, PAD_BACK, PAD_LINES = 0.0095, 0.006, 0.012, 5
 # Surface this far from where a pad comes to rest touches it [m]; the least share of the pads' lines that do; and the
 # largest angles between the closing direction and the surface's normal there, and the line of the forces [rad].
-TOUCH, LEAST_CONTACT, FACING, ALIGNED = 0.0015, 0.2, math.radians(14), math.radians(14)
+TOUCH, LEAST_CONTACT, FACING = 0.0015, 0.2, math.radians(14)
 # Share of the lines that touch beyond which more gain nothing.
 ENOUGH = 0.5
 # Points of the body's surface that the open gripper must not meet, and how deep they may be in it [m].
@@ -185,25 +185,25 @@ def _at_height(
                     yield closing
 
 
-def _pad_lines(R_body_gripper: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "l 3"]:
+def _pad_lines(R_body_gripper: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch l 3"]:
     """Where lines across the pads start from the point between the finger tips [m]."""
-    x, _, z = R_body_gripper.T
     wide, deep = np.linspace(-PAD, PAD, PAD_LINES), np.linspace(-PAD_BACK, PAD_FRONT, PAD_LINES)
-    return (wide[:, None, None] * x + deep[None, :, None] * z).reshape(-1, 3)
+    places = np.stack(np.meshgrid(wide, deep, indexing="ij"), axis=-1).reshape(-1, 2)
+    return places @ np.swapaxes(R_body_gripper[..., ::2], -1, -2)
 
 
 def between(
-    field: Field, R_body_gripper: Float[np.ndarray, "3 3"], point: Float[np.ndarray, " 3"], opening: float
-) -> tuple[Float[np.ndarray, "l 2"], Float[np.ndarray, "l 3"]]:
+    field: Field, R_body_gripper: Float[np.ndarray, "*batch 3 3"], point: Float[np.ndarray, "*batch 3"], opening: float
+) -> tuple[Float[np.ndarray, "*batch l 2"], Float[np.ndarray, "*batch l 3"]]:
     """What is between open fingers: the first and last material on lines across the pads, from the middle of the
     fingers, NaN where there is none [m]; and where the lines start [m]."""
-    across = R_body_gripper[:, 1]
-    starts = point + _pad_lines(R_body_gripper)
+    across = R_body_gripper[..., None, None, :, 1]
+    starts = point[..., None, :] + _pad_lines(R_body_gripper)
     lateral = np.arange(-opening / 2, opening / 2 + ALONG / 2, ALONG)
-    material = np.less(field.at(starts[:, None] + lateral[None, :, None] * across), 0.0)
-    there = np.any(material, axis=1)
-    ends = np.stack([lateral[material.argmax(axis=1)], lateral[::-1][material[:, ::-1].argmax(axis=1)]], axis=1)
-    return np.where(there[:, None], ends, np.nan), starts
+    material = np.less(field.at(starts[..., None, :] + lateral[:, None] * across), 0.0)
+    there = np.any(material, axis=-1)
+    ends = np.stack([lateral[material.argmax(axis=-1)], lateral[::-1][material[..., ::-1].argmax(axis=-1)]], axis=-1)
+    return np.where(there[..., None], ends, np.nan), starts
 
 
 def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], opening: float) -> tuple[float, float]:
@@ -218,32 +218,51 @@ def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], o
 def _closing(
     field: Field, gripper: Gripper, angles: tuple[float, float], point: np.ndarray, usual: float
 ) -> _Line | None:
-    """The candidate at a point, moved to the middle between the closed pads; None if the fingers do not hold there."""
-    R = axes(angles[0], USUAL_TILT, angles[1])
-    across = R[:, 1]
-    ends, starts = between(field, R, point, gripper.max_opening)
-    if np.isnan(ends).all():
+    """The candidate at a point; None if the fingers do not hold there."""
+    (centre,), (share,) = held(field, gripper, axes(angles[0], USUAL_TILT, angles[1])[None], point[None])
+    if share == 0.0:
         return None
-    rest = np.array([np.nanmin(ends[:, 0]), np.nanmax(ends[:, 1])])
-    if rest[1] - rest[0] > gripper.usable_opening:
-        return None
-    touching = [np.abs(ends[:, side] - rest[side]) < TOUCH for side in (0, 1)]
-    share = min(float(touch.mean()) for touch in touching)
-    if share < LEAST_CONTACT:
-        return None
-    middles = []
-    for side, sign in ((0, -1.0), (1, 1.0)):
-        places = starts[touching[side]] + ends[touching[side], side, None] * across
-        facing = field.slope(places + sign * 0.001 * across) @ (sign * across)
-        if float(np.median(facing)) < math.cos(FACING):
-            return None
-        middles.append(places.mean(axis=0))
-    force = middles[1] - middles[0]
-    if force @ across < math.cos(ALIGNED) * float(np.linalg.norm(force)):
-        return None
-    centre = point + 0.5 * float(rest.sum()) * across
     off_axis, off_height = float(np.linalg.norm(centre[:2])), abs(float(centre[2]) - usual)
     return _Line(*angles, centre, min(share, ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
+
+
+def held(
+    field: Field,
+    gripper: Gripper,
+    R_body_gripper: Float[np.ndarray, "k 3 3"],
+    point: Float[np.ndarray, "k 3"],
+    askew: float = FACING,
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Where the middle between the closed pads is [m], and which share of the pads' lines touches the body.
+
+    Args:
+      field: of the body.
+      gripper: that grasps.
+      R_body_gripper: how it is turned.
+      point: the middle between the open fingers [m].
+      askew: largest angles between the closing direction and the surface's normal, and the line of the forces [rad].
+
+    Returns:
+      The share is 0 where the fingers do not hold.
+    """
+    across = R_body_gripper[:, :, 1]
+    ends, starts = between(field, R_body_gripper, point, gripper.max_opening)
+    missing = np.isnan(ends)
+    rest = np.stack([np.where(missing, np.inf, ends)[..., 0].min(axis=1), np.where(missing, -np.inf, ends)[..., 1].max(axis=1)], axis=1)
+    touching = np.abs(ends - rest[:, None]) < TOUCH
+    share = touching.mean(axis=1).min(axis=1)
+    share[(rest[:, 1] - rest[:, 0] > gripper.usable_opening) | (share < LEAST_CONTACT)] = 0.0
+    some = np.flatnonzero(share)
+    across, touching = across[some], touching[some]
+    places = starts[some, :, None] + ends[some, ..., None] * across[:, None, None]
+    outward = np.array([-1.0, 1.0])[:, None] * across[:, None]
+    facing = np.einsum("klsi,ksi->kls", field.slope(places + 0.001 * outward[:, None]), outward)
+    force = np.diff(np.nanmean(np.where(touching[..., None], places, np.nan), axis=1), axis=1)[:, 0]
+    fails = np.nanmedian(np.where(touching, facing, np.nan), axis=1).min(axis=1) < math.cos(askew)
+    fails |= np.sum(force * across, axis=1) < math.cos(askew) * np.linalg.norm(force, axis=1)
+    share[some[fails]] = 0.0
+    middle = np.where(share > 0.0, rest.sum(axis=1) / 2, 0.0)
+    return point + middle[:, None] * R_body_gripper[:, :, 1], share
 
 
 def _chosen(
@@ -252,7 +271,7 @@ def _chosen(
     """The best lines that differ, and that the open gripper reaches at some tilt; every direction has its turn."""
     chosen: list[_Line] = []
     allowed: list[tuple[int, ...]] = []
-    boxes = _boxes(gripper)
+    hand = OpenHand.of(gripper)
     left = list(lines)
     used: dict[float, int] = {}
     while left and len(chosen) < most:
@@ -261,7 +280,9 @@ def _chosen(
         left.remove(line)
         if any(_alike(line, other) for other in chosen):
             continue
-        free = tuple(i for i, tilt in enumerate(tilts) if not _meets(line, tilt, body, boxes))
+        free = tuple(
+            i for i, tilt in enumerate(tilts) if hand.too_deep(body, axes(line.yaw, tilt, line.roll), line.point) == 0.0
+        )
         if free:
             chosen.append(line)
             allowed.append(free)
@@ -284,30 +305,53 @@ def _alike(a: _Line, b: _Line) -> bool:
     return near and math.cos(a.yaw - b.yaw) > math.cos(ALIKE)
 
 
-def _boxes(gripper: Gripper) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Boxes in or around the hand's and the open fingers' primitives: half-extents [m], and pose in the gripper frame.
+@dataclasses.dataclass(frozen=True, eq=False)
+class OpenHand:
+    """Boxes in or around the hand's and the open fingers' primitives.
 
     Links 6 and 7 are behind the hand, beyond the reach of a body between the fingers.
+
+    Attributes:
+      half: their half-extents [m], shape (b, 3).
+      origin, axes: their centres [m], shape (b, 3), and axes as columns, shape (b, 3, 3), in the gripper's frame.
     """
-    primitives: Sequence[Primitive] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
-    return [(np.maximum(np.array(p.size) - SLACK, 1e-3), p.T_frame_primitive) for p in primitives]
 
+    half: Float[np.ndarray, "b 3"]
+    origin: Float[np.ndarray, "b 3"]
+    axes: Float[np.ndarray, "b 3 3"]
 
-def _meets(
-    line: _Line, tilt: float, body: Float[np.ndarray, "n 3"], boxes: list[tuple[np.ndarray, np.ndarray]]
-) -> bool:
-    """Whether the open gripper meets the body on its straight way in: the way of each surface point, seen from the
-    gripper, ends at it and begins far ahead of it."""
-    local = (body - line.point) @ axes(line.yaw, tilt, line.roll)
-    return any(_swept(local, half, T).any() for half, T in boxes)
+    @classmethod
+    def of(cls, gripper: Gripper) -> OpenHand:
+        """The boxes of a gripper, a little smaller than its parts."""
+        parts: Sequence[Primitive] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
+        T = np.stack([part.T_frame_primitive for part in parts])
+        return cls(np.maximum(np.array([part.size for part in parts]) - SLACK, 1e-3), T[:, :3, 3], T[:, :3, :3])
 
+    @property
+    def corners(self) -> Float[np.ndarray, "c 3"]:
+        """Corners of the boxes in the gripper's frame [m]."""
+        signs = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]], indexing="ij"), axis=-1).reshape(-1, 3)
+        return (self.origin[:, None] + (signs * self.half[:, None]) @ np.swapaxes(self.axes, 1, 2)).reshape(-1, 3)
 
-def _swept(points: Float[np.ndarray, "n 3"], half: np.ndarray, T: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Which points a box has passed through that came along its frame's z from far behind."""
-    origin = (points - T[:3, 3]) @ T[:3, :3]
-    along = T[2, :3]
-    safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
-    a, b = (-half - origin) / safe, (half - origin) / safe
-    near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-    # The point's way relative to the gripper: from far ahead (+z) down to where it is.
-    return (near <= far) & (far >= 0.0)
+    def too_deep(
+        self, body: Float[np.ndarray, "n 3"], R_body_gripper: Float[np.ndarray, "3 3"], point: Float[np.ndarray, " 3"]
+    ) -> float:
+        """How far the open hand must stop short of a point so that it meets the body nowhere on its straight way in.
+
+        The way of each surface point, seen from the gripper, ends at it and begins far ahead of it.
+
+        Args:
+          body: points on its surface [m].
+          R_body_gripper, point: where the gripper closes [m].
+
+        Returns:
+          the distance [m], 0 if it need not.
+        """
+        turned = (body - point) @ R_body_gripper @ np.concatenate(list(self.axes), axis=1)
+        seen = turned.reshape(-1, len(self.half), 3) - np.einsum("bi,bij->bj", self.origin, self.axes)
+        along = self.axes[:, 2]
+        step = 1.0 / np.where(np.abs(along) < 1e-9, 1e-9, along)
+        middle, wide = -seen * step, self.half * np.abs(step)
+        near, far = (middle - wide).max(axis=2), (middle + wide).min(axis=2)
+        # The point's way relative to the gripper: from far ahead (+z) down to where it is.
+        return max(float(np.max(far, where=near <= far, initial=0.0)), 0.0)

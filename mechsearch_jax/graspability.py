@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from mechsearch_jax.antipodal_grasps import WRISTS, antipodal_grasps
 from mechsearch_jax.candidate_pairs import PIECES_PAIRS, ROUND_PAIRS, filled_up, pair_tables
 from mechsearch_jax.compound_grasps import axes, closings, most_closings
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
@@ -82,6 +83,7 @@ class GraspConfig:
     # Not in the representation, which identifies saved problems: those of boxes and cylinders do not depend on them.
     rolls: tuple[float, ...] = dataclasses.field(default=(), repr=False)
     steep: tuple[float, ...] = dataclasses.field(default=(), repr=False)
+    antipodal: int = 0
 
     def __post_init__(self):
         if self.yaws < 1 or not self.tilts or not self.wrists:
@@ -102,6 +104,7 @@ class GraspConfig:
             wrists=angles(-60.0, -30.0, 0.0, 30.0, 60.0),
             rolls=angles(-60.0, -30.0, 30.0, 60.0),
             steep=angles(40.0, 50.0),
+            antipodal=600,
         )
 
 
@@ -186,6 +189,11 @@ def _compound_grasps(
     target: Target, compound: Compound, gripper: Gripper, config: GraspConfig
 ) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
     """`_target_grasps` of a target of pieces: each closing of `compound_grasps` at the tilts that it allows."""
+    if config.antipodal:
+        T, wrist = antipodal_grasps(compound, gripper, config.antipodal, config.max_yaw if target.solid.round else math.pi)
+        if len(T):
+            return jnp.asarray(T, jnp.float32), wrist
+        raise InputError("no")
     directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
     yaws = directions.tolist() if target.solid.round else None
     tilts = (*config.tilts, *config.steep)
@@ -240,9 +248,9 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     count = len(wrist)
     if target.is_compound:
         tilts = len(config.tilts) + len(config.steep)
-        most = most_closings(config.rolls) * tilts * len(config.wrists)
+        most = config.antipodal or most_closings(config.rolls) * tilts * len(config.wrists)
         T_target_gripper, wrist = filled_up(T_target_gripper, wrist, most)
-    angles = [WRIST_ORIGIN + a for a in config.wrists]
+    angles = [WRIST_ORIGIN + a for a in (WRISTS if config.antipodal and target.is_compound else config.wrists)]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]
     outward = -np.asarray(T_target_gripper)[:, :3, 2]
