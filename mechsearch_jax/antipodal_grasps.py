@@ -23,23 +23,22 @@ from mechsearch_jax.shapes.solid import Union, surface
 
 # Angles of joint 7 relative to the usual one [rad].
 WRISTS = tuple(math.radians(30 * step) for step in range(-6, 5))
-# Points of the surface from which lines start, and the most lines that are looked at, so many at a time until there are
-# so many closings.
+# A hand that points down by more than the first leaves the arm room only where link 6 is turned about the approach by
+# less than the second from where it is above the hand [rad].
+LOW, UPRIGHT = math.radians(15), math.radians(80)
+# Points of the surface from which lines start, the most lines that are looked at, so many at a time, and the number of
+# poses beyond which no more are.
 STARTS, LINES, AT_ONCE, ENOUGH = 6000, 1000, 50, 400
-# Points of the surface that decide how far the hand comes.
-FEW = 500
+# Steps along a line [m], and the angle to the horizontal under which it is also tried level [rad].
+ALONG, NEARLY_LEVEL = 0.001, math.radians(14)
 # Directions about each line, and the largest angle by which the gripper may point down [rad].
 DIRECTIONS, STEEPEST = 24, math.radians(60)
-# The pads may be so much askew to the surface [rad]: less than where friction of 1 ends. How far before a line the pads
-# may hold [m], and how far from the body the hand then stays [m].
-ASKEW, BEFORE, APART = math.radians(30), 0.012, 0.0005
-# Steps along a line [m].
-ALONG = 0.001
-# Lines that are less askew than this are also tried level [rad].
-NEARLY_LEVEL = math.radians(14)
-# Points on the gripper's way in, and how far in front of the body the board may reach [m].
+# The pads may be so much askew to the surface [rad]: less than where friction of 1 ends. How far before a line they may
+# hold [m], how far from the body the hand then stays [m], and the points of the body that say how far.
+ASKEW, BEFORE, APART, FEW = math.radians(30), 0.012, 0.0005, 500
+# Points on the gripper's way in that must stay above the board, and how far from the body the board may reach [m].
 POINTS, BOARD = 512, 0.2
-# What counts as one step of a line's direction, of the approach, of a turn about it, and of joint 7 [rad]; of a place [m].
+# What counts as one step of a line's direction, of the approach, of a turn about it, of joint 7 [rad], of a place [m].
 AXIS, APPROACH, ROLL, WRIST, PLACE = math.radians(15), math.radians(10), math.radians(20), math.radians(30), 0.02
 
 
@@ -57,39 +56,43 @@ def antipodal_grasps(
     Returns:
       `T_body_gripper`, and the index in `WRISTS` of each one's angle of joint 7.
     """
+    T, bottom = _holding(compound, gripper, max_yaw), Union(compound).bottom
+    ways = [swept_cloud(gripper, gripper.max_opening, WRIST_ORIGIN + angle, POINTS) for angle in WRISTS]
+    turn, down = np.arctan2(T[:, 2, 1], T[:, 2, 0]), np.arcsin(np.clip(-T[:, 2, 2], -1.0, 1.0))
+    swivel = (np.array(WRISTS) + turn[:, None] + math.pi) % (2 * math.pi) - math.pi
+    free = np.stack([_above_board(T, way, bottom) for way in ways], axis=1)
+    row, wrist = np.nonzero(free & ((down < LOW)[:, None] | (np.abs(swivel) < UPRIGHT)))
+    features = [
+        T[row, :3, 2] / APPROACH,
+        np.stack([np.cos(turn), np.sin(turn)], axis=1)[row] / ROLL,
+        np.array(WRISTS)[wrist, None] / WRIST,
+        T[row, :3, 3] / PLACE,
+    ]
+    chosen = _spread(np.hstack(features), count)
+    return T[row[chosen]], wrist[chosen]
+
+
+def _holding(compound: Compound, gripper: Gripper, max_yaw: float) -> Float[np.ndarray, "k 4 4"]:
+    """Poses in which the pads hold the body, and that the open hand reaches free, above the board."""
     field, body = field_of(compound), surface(compound, BODY_POINTS)
-    middle, axis = _lines(field, surface(compound, STARTS), gripper)
-    some = _spread(np.hstack([middle / PLACE, (axis[:, :, None] * axis[:, None]).reshape(-1, 9) / AXIS]), LINES)
     hand, bottom = OpenHand.of(gripper), Union(compound).bottom
-    clouds = [swept_cloud(gripper, gripper.max_opening, WRIST_ORIGIN + angle, POINTS) for angle in WRISTS]
-    corners = hand.corners
-    few = body[:FEW]
-    found: list[np.ndarray] = []
-    for start in range(0, len(some), AT_ONCE):
-        part = some[start : start + AT_ONCE]
-        T = _approaches(middle[part], axis[part], max_yaw)
-        T = T[_clear(T, corners, bottom)]
+    middle, axis = _lines(field, surface(compound, STARTS), gripper)
+    spread = _spread(np.hstack([middle / PLACE, (axis[:, :, None] * axis[:, None]).reshape(-1, 9) / AXIS]), LINES)
+    found = [np.zeros((0, 4, 4))]
+    for start in range(0, len(spread), AT_ONCE):
+        some = spread[start : start + AT_ONCE]
+        T = _approaches(middle[some], axis[some], max_yaw)
+        T = T[_above_board(T, hand.corners, bottom)]
         # A hand whose palm would meet the body stops short of the line.
-        back = np.array([hand.too_deep(few, pose[:3, :3], pose[:3, 3]) for pose in T])
+        back = np.array([hand.too_deep(body[:FEW], pose[:3, :3], pose[:3, 3]) for pose in T])
         T[:, :3, 3] -= (back + APART * (back > 0.0))[:, None] * T[:, :3, 2]
         T = T[back < BEFORE]
         T[:, :3, 3], share = held(field, gripper, T[:, :3, :3], T[:, :3, 3], ASKEW)
-        found += [pose for pose in T[share > 0.0] if hand.too_deep(body, pose[:3, :3], pose[:3, 3]) == 0.0]
-        if len(found) >= ENOUGH:
+        T = T[share > 0.0]
+        found.append(T[[hand.too_deep(body, pose[:3, :3], pose[:3, 3]) == 0.0 for pose in T]])
+        if sum(map(len, found)) >= ENOUGH:
             break
-    T = np.stack(found) if found else np.zeros((0, 4, 4))
-    clear = np.stack([_clear(T, cloud, bottom) for cloud in clouds], axis=1)
-    row, wrist = np.nonzero(clear)
-    T = T[row]
-    turned = np.arctan2(T[:, 2, 1], T[:, 2, 0])
-    features = [
-        T[:, :3, 2] / APPROACH,
-        np.stack([np.cos(turned), np.sin(turned)], axis=1) / ROLL,
-        np.array(WRISTS)[wrist, None] / WRIST,
-        T[:, :3, 3] / PLACE,
-    ]
-    chosen = _spread(np.hstack(features), count)
-    return T[chosen], wrist[chosen]
+    return np.concatenate(found)
 
 
 def _lines(
@@ -131,11 +134,12 @@ def _approaches(
     return T
 
 
-def _clear(T: Float[np.ndarray, "k 4 4"], cloud: Float[np.ndarray, "p 3"], bottom: float) -> Bool[np.ndarray, " k"]:
-    """Whether the gripper's way in, a cloud in its frame, stays above a board `bottom` below the body's origin."""
-    x, y, z = ((T[:, i, :3] @ cloud.T) for i in range(3))
-    near = x**2 + y**2 < BOARD**2
-    return ~(near & (z + T[:, 2, 3, None] < -bottom)).any(axis=1)
+def _above_board(
+    T: Float[np.ndarray, "k 4 4"], cloud: Float[np.ndarray, "p 3"], bottom: float
+) -> Bool[np.ndarray, " k"]:
+    """Whether what is near the body of a cloud in the gripper's frame stays above a board `bottom` below its origin."""
+    x, y, z = (T[:, i, :3] @ cloud.T for i in range(3))
+    return ~((x**2 + y**2 < BOARD**2) & (z + T[:, 2, 3, None] < -bottom)).any(axis=1)
 
 
 def _spread(features: Float[np.ndarray, "n f"], count: int) -> Int[np.ndarray, " m"]:

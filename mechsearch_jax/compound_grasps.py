@@ -1,10 +1,9 @@
 """Grasps of a compound from the side: where two opposite sides of it are near enough for the fingers to close on.
 
-A closing is a line between the fingers, across the approach: level, or slanted where the hand is turned about its
-approach. On lines in several directions, at several heights and depths, the body's sections that fit between the
-fingers are candidates. A closing counts where the pads of
-the closed fingers meet material that faces them, opposite each other, and where the open gripper touches the body
-nowhere on its straight way in.
+A closing is a level line between the fingers, across the approach. On lines in several directions, at several heights
+and depths, the body's sections that fit between the fingers are candidates. A closing counts where the pads of the
+closed fingers meet material that faces them, opposite each other, and where the open gripper touches the body nowhere
+on its straight way in.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mechsearch_jax.robot.gripper import FINGER, Gripper, Primitive, primitives_in_gripper
 from mechsearch_jax.shapes.compound import Compound
@@ -24,8 +23,6 @@ from mechsearch_jax.shapes.solid import surface
 
 # Directions of the approach over a full turn, and the most closings of a body.
 DIRECTIONS, MOST = 24, 16
-# The same of a hand that is turned about its approach, for each angle, and steps of the depth [m].
-TURNED_DIRECTIONS, TURNED_MOST, TURNED_DEPTH = 12, 6, 0.008
 # Heights of closings, least distance from the body's lowest and highest points, and steps of the depth along the
 # approach and along a line [m].
 HEIGHTS, FROM_BOTTOM, FROM_TOP, DEPTH, ALONG = 7, 0.012, 0.005, 0.004, 0.001
@@ -52,46 +49,34 @@ class Closings:
 
     Attributes:
       yaw: direction of the approach, seen from above [rad], shape (c,).
-      roll: by how much the hand is turned about its approach [rad], shape (c,); 0 where the fingers close level.
       point: the middle between the fingers, in the body's frame [m], shape (c, 3).
       tilts: indices of the angles by which the gripper may point down, for each.
     """
 
     yaw: Float[np.ndarray, " c"]
-    roll: Float[np.ndarray, " c"]
     point: Float[np.ndarray, "c 3"]
     tilts: tuple[tuple[int, ...], ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Line:
-    """A candidate: its yaw and roll [rad], its middle [m], and how good it is."""
+    """A candidate: its yaw [rad], its middle [m], and how good it is."""
 
     yaw: float
-    roll: float
     point: np.ndarray
     score: float
 
 
-def axes(yaw: float, tilt: float, roll: float = 0.0) -> Float[np.ndarray, "3 3"]:
-    """The gripper's axes as columns: `grasp_frames.gripper_rotation`, in double precision, turned by a roll [rad]."""
+def axes(yaw: float, tilt: float) -> Float[np.ndarray, "3 3"]:
+    """The gripper's axes as columns: `grasp_frames.gripper_rotation`, in double precision [rad]."""
     c, s, cosine, sine = math.cos(yaw), math.sin(yaw), math.cos(tilt), math.sin(tilt)
-    level = np.array([[c * sine, s, c * cosine], [s * sine, -c, s * cosine], [cosine, 0.0, -sine]])
-    if roll == 0.0:
-        return level
-    c, s = math.cos(roll), math.sin(roll)
-    return level @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.array([[c * sine, s, c * cosine], [s * sine, -c, s * cosine], [cosine, 0.0, -sine]])
 
 
 def closings(
-    compound: Compound,
-    gripper: Gripper,
-    yaws: Sequence[float] | None,
-    tilts: Sequence[float],
-    height: float,
-    rolls: Sequence[float] = (),
+    compound: Compound, gripper: Gripper, yaws: Sequence[float] | None, tilts: Sequence[float], height: float
 ) -> Closings:
-    """The best different closings on a compound: at most `MOST` level ones, and `TURNED_MOST` for each roll.
+    """The best different closings on a compound, at most `MOST`.
 
     Args:
       compound: centred.
@@ -100,29 +85,14 @@ def closings(
         `DIRECTIONS` directions.
       tilts: angles by which the gripper points down [rad].
       height: usual height above the centre of mass [m].
-      rolls: angles other than 0 by which the hand may be turned about its approach [rad].
     """
     body = surface(compound, BODY_POINTS)
-
-    def found(roll: float, directions: int, most: int) -> Closings:
-        if yaws is None:
-            angles = tuple(2 * math.pi * i / directions for i in range(directions))
-            return _chosen(_lines(compound, gripper, angles, height, roll), gripper, body, tilts, most)
-        angles = tuple(yaws)[:: math.ceil(len(yaws) / most)]
-        lines = _lines(compound, gripper, (0.0,), height, roll)
-        return _turned(_chosen(lines, gripper, body, tilts, max(most // len(angles), 1)), angles)
-
-    return _joined([found(0.0, DIRECTIONS, MOST), *(found(roll, TURNED_DIRECTIONS, TURNED_MOST) for roll in rolls)])
-
-
-def most_closings(rolls: Sequence[float]) -> int:
-    """The largest number of `closings` with such rolls."""
-    return MOST + TURNED_MOST * len(rolls)
-
-
-def _joined(parts: Sequence[Closings]) -> Closings:
-    yaw, roll, point = (np.concatenate([getattr(part, name) for part in parts]) for name in ("yaw", "roll", "point"))
-    return Closings(yaw, roll, point, tuple(tilts for part in parts for tilts in part.tilts))
+    if yaws is None:
+        directions = tuple(2 * math.pi * i / DIRECTIONS for i in range(DIRECTIONS))
+        return _chosen(_lines(compound, gripper, directions, height), gripper, body, tilts, MOST)
+    angles = tuple(yaws)[:: math.ceil(len(yaws) / MOST)]
+    lines = _lines(compound, gripper, (0.0,), height)
+    return _turned(_chosen(lines, gripper, body, tilts, max(MOST // len(angles), 1)), angles)
 
 
 def _turned(single: Closings, angles: Sequence[float]) -> Closings:
@@ -130,28 +100,21 @@ def _turned(single: Closings, angles: Sequence[float]) -> Closings:
     turns = [axes(angle, 0.0)[:, [2, 1, 0]] * [1.0, -1.0, 1.0] for angle in angles]
     return Closings(
         np.repeat(np.array(angles), len(single.yaw)),
-        np.tile(single.roll, len(angles)),
         np.concatenate([single.point @ turn.T for turn in turns]),
         single.tilts * len(angles),
     )
 
 
 @functools.lru_cache(maxsize=32)
-def _lines(
-    compound: Compound, gripper: Gripper, angles: tuple[float, ...], height: float, roll: float
-) -> tuple[_Line, ...]:
+def _lines(compound: Compound, gripper: Gripper, angles: tuple[float, ...], height: float) -> tuple[_Line, ...]:
     """All candidates, the best first."""
     field = field_of(compound)
     low, high = _ends(field)
     usual = min(height, 0.6 * high)
-    found, body = [], surface(compound, BODY_POINTS)
+    found = []
     for yaw in angles:
-        # Of a level hand the lines are level at any tilt, and their heights are those above the board.
-        R = axes(yaw, USUAL_TILT if roll else 0.0, roll)
-        ends = (low, high) if roll == 0.0 else ((body @ R[:, 0]).min(), (body @ R[:, 0]).max())
-        heights = np.linspace(ends[0] + FROM_BOTTOM, max(ends[1] - FROM_TOP, ends[0] + FROM_BOTTOM), HEIGHTS)
-        for z in heights if roll else (*heights, usual):
-            found += _at_height(field, gripper, R, (yaw, roll), z, usual)
+        for z in (*np.linspace(low + FROM_BOTTOM, max(high - FROM_TOP, low + FROM_BOTTOM), HEIGHTS), usual):
+            found += _at_height(field, gripper, yaw, z, usual)
     return tuple(sorted(found, key=lambda line: -line.score))
 
 
@@ -161,28 +124,30 @@ def _ends(field: Field) -> tuple[float, float]:
     return tuple(float(field.low[2] + field.step * i) for i in (inside[0], inside[-1]))  # pyright: ignore[reportReturnType]
 
 
-def _at_height(
-    field: Field, gripper: Gripper, R: Float[np.ndarray, "3 3"], angles: tuple[float, float], z: float, usual: float
-) -> Iterator[_Line]:
-    """The candidates of a direction, yaw and roll [rad], whose lines run along R's y, `z` along its x [m]."""
-    up, across, ahead = R.T
-    widths = np.maximum(np.abs(field.low), np.abs(field.high))
-    reach = float(np.linalg.norm(widths if angles[1] else widths[:2]))
-    depths = np.arange(-reach, reach, TURNED_DEPTH if angles[1] else DEPTH)
-    lateral = np.arange(-reach, reach, ALONG)
+def _at_height(field: Field, gripper: Gripper, yaw: float, z: float, usual: float) -> Iterator[_Line]:
+    """The candidates of a direction [rad] at a height [m]."""
+    # Of a level line, whatever the tilt.
+    up, across, ahead = axes(yaw, 0.0).T
+    reach = float(np.linalg.norm(np.maximum(np.abs(field.low), np.abs(field.high))[:2]))
+    depths, lateral = np.arange(-reach, reach, DEPTH), np.arange(-reach, reach, ALONG)
     points = depths[:, None, None] * ahead + lateral[None, :, None] * across + z * up
     material = field.at(points) < 0.0
+    places = []
     for row, depth in zip(material, depths, strict=True):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
         starts, stops = edges[::2], edges[1::2]
         for i in range(len(starts)):
             for j in range(i, len(starts)):
                 first, last = lateral[starts[i]], lateral[stops[j] - 1]
-                if last - first > gripper.usable_opening:
-                    continue
-                point = depth * ahead + 0.5 * (first + last) * across + z * up
-                if (closing := _closing(field, gripper, angles, point, usual)) is not None:
-                    yield closing
+                if last - first <= gripper.usable_opening:
+                    places.append(depth * ahead + 0.5 * (first + last) * across + z * up)
+    if not places:
+        return
+    R = np.broadcast_to(axes(yaw, USUAL_TILT), (len(places), 3, 3))
+    for centre, share in zip(*held(field, gripper, R, np.stack(places)), strict=True):
+        if share > 0.0:
+            off_axis, off_height = float(np.linalg.norm(centre[:2])), abs(float(centre[2]) - usual)
+            yield _Line(yaw, centre, min(float(share), ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
 
 
 def _pad_lines(R_body_gripper: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch l 3"]:
@@ -215,17 +180,6 @@ def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], o
     return float(np.nanmax(ends[:, 1] - ends[:, 0])) / 2, float(np.nanmax(ends[:, 1]) - np.nanmin(ends[:, 0])) / 2
 
 
-def _closing(
-    field: Field, gripper: Gripper, angles: tuple[float, float], point: np.ndarray, usual: float
-) -> _Line | None:
-    """The candidate at a point; None if the fingers do not hold there."""
-    (centre,), (share,) = held(field, gripper, axes(angles[0], USUAL_TILT, angles[1])[None], point[None])
-    if share == 0.0:
-        return None
-    off_axis, off_height = float(np.linalg.norm(centre[:2])), abs(float(centre[2]) - usual)
-    return _Line(*angles, centre, min(share, ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
-
-
 def held(
     field: Field,
     gripper: Gripper,
@@ -248,7 +202,9 @@ def held(
     across = R_body_gripper[:, :, 1]
     ends, starts = between(field, R_body_gripper, point, gripper.max_opening)
     missing = np.isnan(ends)
-    rest = np.stack([np.where(missing, np.inf, ends)[..., 0].min(axis=1), np.where(missing, -np.inf, ends)[..., 1].max(axis=1)], axis=1)
+    rest = np.stack(
+        [np.where(missing, np.inf, ends).min(axis=1)[:, 0], np.where(missing, -np.inf, ends).max(axis=1)[:, 1]], 1
+    )
     touching = np.abs(ends - rest[:, None]) < TOUCH
     share = touching.mean(axis=1).min(axis=1)
     share[(rest[:, 1] - rest[:, 0] > gripper.usable_opening) | (share < LEAST_CONTACT)] = 0.0
@@ -261,7 +217,8 @@ def held(
     fails = np.nanmedian(np.where(touching, facing, np.nan), axis=1).min(axis=1) < math.cos(askew)
     fails |= np.sum(force * across, axis=1) < math.cos(askew) * np.linalg.norm(force, axis=1)
     share[some[fails]] = 0.0
-    middle = np.where(share > 0.0, rest.sum(axis=1) / 2, 0.0)
+    middle = np.zeros(len(share))
+    middle[some] = rest[some].sum(axis=1) / 2
     return point + middle[:, None] * R_body_gripper[:, :, 1], share
 
 
@@ -280,16 +237,13 @@ def _chosen(
         left.remove(line)
         if any(_alike(line, other) for other in chosen):
             continue
-        free = tuple(
-            i for i, tilt in enumerate(tilts) if hand.too_deep(body, axes(line.yaw, tilt, line.roll), line.point) == 0.0
-        )
+        free = tuple(i for i, tilt in enumerate(tilts) if hand.too_deep(body, axes(line.yaw, tilt), line.point) == 0.0)
         if free:
             chosen.append(line)
             allowed.append(free)
             used[line.yaw] = used.get(line.yaw, 0) + 1
     return Closings(
         np.array([line.yaw for line in chosen]),
-        np.array([line.roll for line in chosen]),
         np.array([line.point for line in chosen]).reshape(-1, 3),
         tuple(allowed),
     )
