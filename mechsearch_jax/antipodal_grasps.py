@@ -28,14 +28,14 @@ WRISTS = tuple(math.radians(30 * step) for step in range(-6, 5))
 LOW, UPRIGHT = math.radians(15), math.radians(80)
 # Points of the surface from which lines start, the most lines that are looked at, so many at a time, and the number of
 # poses beyond which no more are.
-STARTS, LINES, AT_ONCE, ENOUGH = 6000, 1000, 50, 400
+STARTS, LINES, AT_ONCE, ENOUGH = 6000, 1000, 50, 600
 # Steps along a line [m], and the angle to the horizontal under which it is also tried level [rad].
 ALONG, NEARLY_LEVEL = 0.001, math.radians(14)
 # Directions about each line, and the largest angle by which the gripper may point down [rad].
 DIRECTIONS, STEEPEST = 24, math.radians(60)
 # The pads may be so much askew to the surface [rad]: less than where friction of 1 ends. How far before a line they may
 # hold [m], how far from the body the hand then stays [m], and the points of the body that say how far.
-ASKEW, BEFORE, APART, FEW = math.radians(30), 0.012, 0.0005, 500
+ASKEW, BEFORE, APART, FEW = math.radians(30), 0.012, 0.0005, 300
 # Points on the gripper's way in that must stay above the board, and how far from the body the board may reach [m].
 POINTS, BOARD = 512, 0.2
 # What counts as one step of a line's direction, of the approach, of a turn about it, of joint 7 [rad], of a place [m].

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mechsearch_jax.robot.gripper import FINGER, Gripper, Primitive, primitives_in_gripper
 from mechsearch_jax.shapes.compound import Compound
@@ -93,6 +93,29 @@ def closings(
     angles = tuple(yaws)[:: math.ceil(len(yaws) / MOST)]
     lines = _lines(compound, gripper, (0.0,), height)
     return _turned(_chosen(lines, gripper, body, tilts, max(MOST // len(angles), 1)), angles)
+
+
+def level_grasps(
+    compound: Compound,
+    gripper: Gripper,
+    yaws: Sequence[float] | None,
+    tilts: Sequence[float],
+    wrists: int,
+    height: float,
+) -> tuple[Float[np.ndarray, "g 4 4"], Int[np.ndarray, " g"]]:
+    """`T_body_gripper` of the `closings` at the tilts that they allow, each with all of so many angles of joint 7, and
+    the index of that angle.
+
+    Args:
+      compound, gripper, yaws, tilts, height: as of `closings`.
+      wrists: number of angles of joint 7.
+    """
+    found = closings(compound, gripper, yaws, tilts, height)
+    each = [(i, tilt) for i in range(len(found.yaw)) for tilt in found.tilts[i]]
+    T = np.tile(np.eye(4), (len(each), 1, 1))
+    for pose, (i, tilt) in zip(T, each, strict=True):
+        pose[:3, :3], pose[:3, 3] = axes(found.yaw[i], tilts[tilt]), found.point[i]
+    return np.repeat(T, wrists, axis=0), np.tile(np.arange(wrists), len(T))
 
 
 def _turned(single: Closings, angles: Sequence[float]) -> Closings:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.antipodal_grasps import WRISTS, antipodal_grasps
 from mechsearch_jax.candidate_pairs import PIECES_PAIRS, ROUND_PAIRS, filled_up, pair_tables
-from mechsearch_jax.compound_grasps import MOST, axes, closings
+from mechsearch_jax.compound_grasps import MOST, level_grasps
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
@@ -154,12 +154,12 @@ class CandidateGrasps(GraspTables):
 
 
 class _Grasps(NamedTuple):
-    """`T_target_gripper` of each grasp, the index of its wrist, the angles of the wrists [rad], and room for grasps."""
+    """Grasps of a target, the index of the wrist of each, the angles of the wrists [rad], and the room for grasps."""
 
     T_target_gripper: Float[Array, "g 4 4"]
     wrist: Int[np.ndarray, " g"]
     wrists: tuple[float, ...]
-    rows: int
+    room: int
 
 
 def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig) -> _Grasps:
@@ -190,34 +190,23 @@ def _posed(yaw: np.ndarray, tilt: np.ndarray, point: np.ndarray) -> Float[Array,
 
 
 def _compound_grasps(target: Target, compound: Compound, gripper: Gripper, config: GraspConfig) -> _Grasps:
-    """`_target_grasps` of a target of pieces: each closing of `compound_grasps` at the tilts that it allows, or those
-    of `antipodal_grasps` if they are wanted, or if there are no others."""
-    rows, room = [], MOST * len(config.tilts) * len(config.wrists)
+    """`_target_grasps` of a target of pieces: its `antipodal_grasps` if they are wanted or there are no level ones."""
+    room = config.antipodal or MOST * len(config.tilts) * len(config.wrists)
     if not config.antipodal:
         directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
         yaws = directions.tolist() if target.solid.round else None
-        found = closings(compound, gripper, yaws, config.tilts, config.height)
-        rows = [
-            (found.yaw[i], config.tilts[tilt], wrist, *found.point[i])
-            for i in range(len(found.yaw))
-            for tilt in found.tilts[i]
-            for wrist in range(len(config.wrists))
-        ]
-    if rows:
-        table = np.array(rows)
-        T = np.tile(np.eye(4), (len(table), 1, 1))
-        T[:, :3, :3] = [axes(*angles) for angles in table[:, :2]]
-        T[:, :3, 3] = table[:, 3:]
-        return _Grasps(jnp.asarray(T, jnp.float32), table[:, 2].astype(int), config.wrists, room)
+        T, wrist = level_grasps(compound, gripper, yaws, config.tilts, len(config.wrists), config.height)
+        if len(T):
+            return _Grasps(jnp.asarray(T, jnp.float32), wrist, config.wrists, room)
     # Of one that looks alike at every yaw grasps about +x do.
     widest = config.max_yaw if target.solid.round else math.pi
-    T, wrist = antipodal_grasps(compound, gripper, config.antipodal or room, widest)
+    T, wrist = antipodal_grasps(compound, gripper, room, widest)
     if not len(T):
         raise InputError(
             f"Target: the gripper fits nowhere: it takes {gripper.usable_opening} m between two opposite sides that its"
             " open fingers reach from the side or from above; use another target"
         )
-    return _Grasps(jnp.asarray(T, jnp.float32), wrist, WRISTS, config.antipodal or room)
+    return _Grasps(jnp.asarray(T, jnp.float32), wrist, WRISTS, room)
 
 
 def feasible_grasps(
