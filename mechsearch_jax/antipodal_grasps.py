@@ -68,7 +68,7 @@ def antipodal_grasps(
         np.array(WRISTS)[wrist, None] / WRIST,
         T[row, :3, 3] / PLACE,
     ]
-    chosen = _spread(np.hstack(features), count)
+    chosen = spread(np.hstack(features), count)
     return T[row[chosen]], wrist[chosen]
 
 
@@ -77,10 +77,10 @@ def _holding(compound: Compound, gripper: Gripper, max_yaw: float) -> Float[np.n
     field, body = field_of(compound), surface(compound, BODY_POINTS)
     hand, bottom = OpenHand.of(gripper), Union(compound).bottom
     middle, axis = _lines(field, surface(compound, STARTS), gripper)
-    spread = _spread(np.hstack([middle / PLACE, (axis[:, :, None] * axis[:, None]).reshape(-1, 9) / AXIS]), LINES)
+    order = spread(np.hstack([middle / PLACE, (axis[:, :, None] * axis[:, None]).reshape(-1, 9) / AXIS]), LINES)
     found = [np.zeros((0, 4, 4))]
-    for start in range(0, len(spread), AT_ONCE):
-        some = spread[start : start + AT_ONCE]
+    for start in range(0, len(order), AT_ONCE):
+        some = order[start : start + AT_ONCE]
         T = _approaches(middle[some], axis[some], max_yaw)
         T = T[_above_board(T, hand.corners, bottom)]
         # A hand whose palm would meet the body stops short of the line.
@@ -89,7 +89,8 @@ def _holding(compound: Compound, gripper: Gripper, max_yaw: float) -> Float[np.n
         T = T[back < BEFORE]
         T[:, :3, 3], share = held(field, gripper, T[:, :3, :3], T[:, :3, 3], ASKEW)
         T = T[share > 0.0]
-        found.append(T[[hand.too_deep(body, pose[:3, :3], pose[:3, 3]) == 0.0 for pose in T]])
+        free = [hand.too_deep(body, pose[:3, :3], pose[:3, 3]) == 0.0 for pose in T]
+        found.append(T[np.array(free, bool)])
         if sum(map(len, found)) >= ENOUGH:
             break
     return np.concatenate(found)
@@ -142,7 +143,7 @@ def _above_board(
     return ~((x**2 + y**2 < BOARD**2) & (z + T[:, 2, 3, None] < -bottom)).any(axis=1)
 
 
-def _spread(features: Float[np.ndarray, "n f"], count: int) -> Int[np.ndarray, " m"]:
+def spread(features: Float[np.ndarray, "n f"], count: int) -> Int[np.ndarray, " m"]:
     """Rows that are far from each other, each the farthest from all before; the first is the nearest to the middle."""
     if not len(features):
         return np.zeros(0, int)
