@@ -140,7 +140,8 @@ def _above_board(
 ) -> Bool[np.ndarray, " k"]:
     """Whether what is near the body of a cloud in the gripper's frame stays above a board `bottom` below its origin."""
     x, y, z = (T[:, i, :3] @ cloud.T for i in range(3))
-    return ~((x**2 + y**2 < BOARD**2) & (z + T[:, 2, 3, None] < -bottom)).any(axis=1)
+    beneath = (x**2 + y**2 < BOARD**2) & (z + T[:, 2, 3, None] < -bottom)
+    return np.logical_not(beneath.any(axis=1))
 
 
 def spread(features: Float[np.ndarray, "n f"], count: int) -> Int[np.ndarray, " m"]:

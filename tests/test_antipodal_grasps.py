@@ -22,6 +22,11 @@ GRIPPER = Gripper()
 BOXES = primitives_in_gripper(GRIPPER, GRIPPER.max_opening, 0.0)[:11]
 
 
+def compound_of(target):
+    assert target.compound is not None
+    return target.compound
+
+
 def meets(body, pose, slack):
     """Whether a box of the open hand holds a point of the body on the way in: by places on the way, float64."""
     local = (body - pose[:3, 3]) @ pose[:3, :3]
@@ -36,7 +41,7 @@ def meets(body, pose, slack):
 
 @pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS.keys())
 def test_the_fingers_close_on_material_that_the_open_hand_reaches_free(target):
-    T, wrist = antipodal_grasps(target.compound, GRIPPER, 300)
+    T, wrist = antipodal_grasps(compound_of(target), GRIPPER, 300)
     assert len(T) == len(wrist) == 300
     assert set(wrist) <= set(range(len(WRISTS)))
     R = T[:, :3, :3]
@@ -46,9 +51,9 @@ def test_the_fingers_close_on_material_that_the_open_hand_reaches_free(target):
     tilt = np.arcsin(np.clip(-R[:, 2, 2], -1.0, 1.0))
     assert (tilt > -2e-3).all()
     assert (tilt <= STEEPEST).all()
-    body = surface(target.compound, 1500)
+    body = surface(compound_of(target), 1500)
     for pose in T[::10]:
-        low, high = grip_between(target.compound, pose, GRIPPER.max_opening)
+        low, high = grip_between(compound_of(target), pose, GRIPPER.max_opening)
         assert 0.001 < low <= high <= GRIPPER.usable_opening / 2 + 1e-3
         assert not meets(body, pose, 0.002)
     # The hand stays above the board.
@@ -59,21 +64,21 @@ def test_the_fingers_close_on_material_that_the_open_hand_reaches_free(target):
 
 @pytest.mark.parametrize("name", ["cup", "tee"])
 def test_whatever_the_yaw_many_grasps_come_from_the_front(name):
-    T, _ = antipodal_grasps(TARGETS[name].compound, GRIPPER, 600)
+    T, _ = antipodal_grasps(compound_of(TARGETS[name]), GRIPPER, 600)
     yaw = np.arctan2(T[:, 1, 2], T[:, 0, 2])
     for turned in np.radians(np.arange(0, 360, 15)):
         assert (np.cos(yaw + turned) > math.cos(math.radians(45))).sum() >= 60
 
 
 def test_the_same_body_has_the_same_grasps():
-    (T, wrist), (again, other) = (antipodal_grasps(TARGETS["tee"].compound, GRIPPER, 50) for _ in range(2))
+    (T, wrist), (again, other) = (antipodal_grasps(compound_of(TARGETS["tee"]), GRIPPER, 50) for _ in range(2))
     np.testing.assert_array_equal(T, again)
     np.testing.assert_array_equal(wrist, other)
 
 
 def test_how_far_a_hand_must_stop_short_is_where_it_meets_nothing():
-    body, hand = surface(TARGETS["cup"].compound, 400), OpenHand.of(GRIPPER)
-    T, _ = antipodal_grasps(TARGETS["cup"].compound, GRIPPER, 40)
+    body, hand = surface(compound_of(TARGETS["cup"]), 400), OpenHand.of(GRIPPER)
+    T, _ = antipodal_grasps(compound_of(TARGETS["cup"]), GRIPPER, 40)
     deep = 0
     for pose in T[::4]:
         ahead = pose.copy()
@@ -115,7 +120,7 @@ def test_what_slopes_is_taken_by_a_hand_that_is_turned_about_its_approach():
     slope = math.radians(30)
     bar = Piece("box", (0.02, 0.06, 0.015), (0.0, 0.0, 0.07), (math.cos(slope / 2), math.sin(slope / 2), 0.0, 0.0))
     target = Target.from_parts((bar, Piece("box", (0.045, 0.045, 0.01), (0.0, 0.0, 0.01))))
-    T, _ = antipodal_grasps(target.compound, GRIPPER, 300)
+    T, _ = antipodal_grasps(compound_of(target), GRIPPER, 300)
     turned = np.degrees(np.arcsin(np.abs(T[:, 2, 1])))
     assert (turned > 20).sum() > 30
 
