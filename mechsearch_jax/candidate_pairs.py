@@ -27,6 +27,11 @@ def filled_up(
     return np.concatenate([T, np.repeat(none, missing, axis=0)]), np.pad(wrist, (0, missing), mode="edge")
 
 
+def is_grasp(T_target_gripper: Float[Array | np.ndarray, "g 4 4"]) -> Bool[np.ndarray, " g"]:
+    """Which of the rows of `filled_up` hold a grasp."""
+    return np.asarray(T_target_gripper)[:, 2, 3] > -0.5 * NO_GRASP
+
+
 def pair_tables(able: Bool[np.ndarray, "x g"], most: int | None = None) -> dict[str, Any]:
     """The fields of `graspability.CandidateGrasps` for the feasible pairs of a candidate pose and a grasp.
 

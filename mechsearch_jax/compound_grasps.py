@@ -1,10 +1,9 @@
 """Grasps of a compound from the side: where two opposite sides of it are near enough for the fingers to close on.
 
-A closing is a line between the fingers, across the approach: level, or slanted where the hand is turned about its
-approach. On lines in several directions, at several heights and depths, the body's sections that fit between the
-fingers are candidates. A closing counts where the pads of
-the closed fingers meet material that faces them, opposite each other, and where the open gripper touches the body
-nowhere on its straight way in.
+A closing is a level line between the fingers, across the approach. On lines in several directions, at several heights
+and depths, the body's sections that fit between the fingers are candidates. A closing counts where the pads of the
+closed fingers meet material that faces them, opposite each other, and where the open gripper touches the body nowhere
+on its straight way in.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
 from mechsearch_jax.robot.gripper import FINGER, Gripper, Primitive, primitives_in_gripper
 from mechsearch_jax.shapes.compound import Compound
@@ -24,8 +23,6 @@ from mechsearch_jax.shapes.solid import surface
 
 # Directions of the approach over a full turn, and the most closings of a body.
 DIRECTIONS, MOST = 24, 16
-# The same of a hand that is turned about its approach, for each angle, and steps of the depth [m].
-TURNED_DIRECTIONS, TURNED_MOST, TURNED_DEPTH = 12, 6, 0.008
 # Heights of closings, least distance from the body's lowest and highest points, and steps of the depth along the
 # approach and along a line [m].
 HEIGHTS, FROM_BOTTOM, FROM_TOP, DEPTH, ALONG = 7, 0.012, 0.005, 0.004, 0.001
@@ -33,7 +30,7 @@ HEIGHTS, FROM_BOTTOM, FROM_TOP, DEPTH, ALONG = 7, 0.012, 0.005, 0.004, 0.001
 PAD, PAD_FRONT, PAD_BACK, PAD_LINES = 0.0095, 0.006, 0.012, 5
 # Surface this far from where a pad comes to rest touches it [m]; the least share of the pads' lines that do; and the
 # largest angles between the closing direction and the surface's normal there, and the line of the forces [rad].
-TOUCH, LEAST_CONTACT, FACING, ALIGNED = 0.0015, 0.2, math.radians(14), math.radians(14)
+TOUCH, LEAST_CONTACT, FACING = 0.0015, 0.2, math.radians(14)
 # Share of the lines that touch beyond which more gain nothing.
 ENOUGH = 0.5
 # Points of the body's surface that the open gripper must not meet, and how deep they may be in it [m].
@@ -52,46 +49,34 @@ class Closings:
 
     Attributes:
       yaw: direction of the approach, seen from above [rad], shape (c,).
-      roll: by how much the hand is turned about its approach [rad], shape (c,); 0 where the fingers close level.
       point: the middle between the fingers, in the body's frame [m], shape (c, 3).
       tilts: indices of the angles by which the gripper may point down, for each.
     """
 
     yaw: Float[np.ndarray, " c"]
-    roll: Float[np.ndarray, " c"]
     point: Float[np.ndarray, "c 3"]
     tilts: tuple[tuple[int, ...], ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Line:
-    """A candidate: its yaw and roll [rad], its middle [m], and how good it is."""
+    """A candidate: its yaw [rad], its middle [m], and how good it is."""
 
     yaw: float
-    roll: float
     point: np.ndarray
     score: float
 
 
-def axes(yaw: float, tilt: float, roll: float = 0.0) -> Float[np.ndarray, "3 3"]:
-    """The gripper's axes as columns: `grasp_frames.gripper_rotation`, in double precision, turned by a roll [rad]."""
+def axes(yaw: float, tilt: float) -> Float[np.ndarray, "3 3"]:
+    """The gripper's axes as columns: `grasp_frames.gripper_rotation`, in double precision [rad]."""
     c, s, cosine, sine = math.cos(yaw), math.sin(yaw), math.cos(tilt), math.sin(tilt)
-    level = np.array([[c * sine, s, c * cosine], [s * sine, -c, s * cosine], [cosine, 0.0, -sine]])
-    if roll == 0.0:
-        return level
-    c, s = math.cos(roll), math.sin(roll)
-    return level @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.array([[c * sine, s, c * cosine], [s * sine, -c, s * cosine], [cosine, 0.0, -sine]])
 
 
 def closings(
-    compound: Compound,
-    gripper: Gripper,
-    yaws: Sequence[float] | None,
-    tilts: Sequence[float],
-    height: float,
-    rolls: Sequence[float] = (),
+    compound: Compound, gripper: Gripper, yaws: Sequence[float] | None, tilts: Sequence[float], height: float
 ) -> Closings:
-    """The best different closings on a compound: at most `MOST` level ones, and `TURNED_MOST` for each roll.
+    """The best different closings on a compound, at most `MOST`.
 
     Args:
       compound: centred.
@@ -100,29 +85,37 @@ def closings(
         `DIRECTIONS` directions.
       tilts: angles by which the gripper points down [rad].
       height: usual height above the centre of mass [m].
-      rolls: angles other than 0 by which the hand may be turned about its approach [rad].
     """
     body = surface(compound, BODY_POINTS)
-
-    def found(roll: float, directions: int, most: int) -> Closings:
-        if yaws is None:
-            angles = tuple(2 * math.pi * i / directions for i in range(directions))
-            return _chosen(_lines(compound, gripper, angles, height, roll), gripper, body, tilts, most)
-        angles = tuple(yaws)[:: math.ceil(len(yaws) / most)]
-        lines = _lines(compound, gripper, (0.0,), height, roll)
-        return _turned(_chosen(lines, gripper, body, tilts, max(most // len(angles), 1)), angles)
-
-    return _joined([found(0.0, DIRECTIONS, MOST), *(found(roll, TURNED_DIRECTIONS, TURNED_MOST) for roll in rolls)])
+    if yaws is None:
+        directions = tuple(2 * math.pi * i / DIRECTIONS for i in range(DIRECTIONS))
+        return _chosen(_lines(compound, gripper, directions, height), gripper, body, tilts, MOST)
+    angles = tuple(yaws)[:: math.ceil(len(yaws) / MOST)]
+    lines = _lines(compound, gripper, (0.0,), height)
+    return _turned(_chosen(lines, gripper, body, tilts, max(MOST // len(angles), 1)), angles)
 
 
-def most_closings(rolls: Sequence[float]) -> int:
-    """The largest number of `closings` with such rolls."""
-    return MOST + TURNED_MOST * len(rolls)
+def level_grasps(
+    compound: Compound,
+    gripper: Gripper,
+    yaws: Sequence[float] | None,
+    tilts: Sequence[float],
+    wrists: int,
+    height: float,
+) -> tuple[Float[np.ndarray, "g 4 4"], Int[np.ndarray, " g"]]:
+    """`T_body_gripper` of the `closings` at the tilts that they allow, each with all of so many angles of joint 7, and
+    the index of that angle.
 
-
-def _joined(parts: Sequence[Closings]) -> Closings:
-    yaw, roll, point = (np.concatenate([getattr(part, name) for part in parts]) for name in ("yaw", "roll", "point"))
-    return Closings(yaw, roll, point, tuple(tilts for part in parts for tilts in part.tilts))
+    Args:
+      compound, gripper, yaws, tilts, height: as of `closings`.
+      wrists: number of angles of joint 7.
+    """
+    found = closings(compound, gripper, yaws, tilts, height)
+    each = [(i, tilt) for i in range(len(found.yaw)) for tilt in found.tilts[i]]
+    T = np.tile(np.eye(4), (len(each), 1, 1))
+    for pose, (i, tilt) in zip(T, each, strict=True):
+        pose[:3, :3], pose[:3, 3] = axes(found.yaw[i], tilts[tilt]), found.point[i]
+    return np.repeat(T, wrists, axis=0), np.tile(np.arange(wrists), len(T))
 
 
 def _turned(single: Closings, angles: Sequence[float]) -> Closings:
@@ -130,28 +123,21 @@ def _turned(single: Closings, angles: Sequence[float]) -> Closings:
     turns = [axes(angle, 0.0)[:, [2, 1, 0]] * [1.0, -1.0, 1.0] for angle in angles]
     return Closings(
         np.repeat(np.array(angles), len(single.yaw)),
-        np.tile(single.roll, len(angles)),
         np.concatenate([single.point @ turn.T for turn in turns]),
         single.tilts * len(angles),
     )
 
 
 @functools.lru_cache(maxsize=32)
-def _lines(
-    compound: Compound, gripper: Gripper, angles: tuple[float, ...], height: float, roll: float
-) -> tuple[_Line, ...]:
+def _lines(compound: Compound, gripper: Gripper, angles: tuple[float, ...], height: float) -> tuple[_Line, ...]:
     """All candidates, the best first."""
     field = field_of(compound)
     low, high = _ends(field)
     usual = min(height, 0.6 * high)
-    found, body = [], surface(compound, BODY_POINTS)
+    found = []
     for yaw in angles:
-        # Of a level hand the lines are level at any tilt, and their heights are those above the board.
-        R = axes(yaw, USUAL_TILT if roll else 0.0, roll)
-        ends = (low, high) if roll == 0.0 else ((body @ R[:, 0]).min(), (body @ R[:, 0]).max())
-        heights = np.linspace(ends[0] + FROM_BOTTOM, max(ends[1] - FROM_TOP, ends[0] + FROM_BOTTOM), HEIGHTS)
-        for z in heights if roll else (*heights, usual):
-            found += _at_height(field, gripper, R, (yaw, roll), z, usual)
+        for z in (*np.linspace(low + FROM_BOTTOM, max(high - FROM_TOP, low + FROM_BOTTOM), HEIGHTS), usual):
+            found += _at_height(field, gripper, yaw, z, usual)
     return tuple(sorted(found, key=lambda line: -line.score))
 
 
@@ -161,49 +147,51 @@ def _ends(field: Field) -> tuple[float, float]:
     return tuple(float(field.low[2] + field.step * i) for i in (inside[0], inside[-1]))  # pyright: ignore[reportReturnType]
 
 
-def _at_height(
-    field: Field, gripper: Gripper, R: Float[np.ndarray, "3 3"], angles: tuple[float, float], z: float, usual: float
-) -> Iterator[_Line]:
-    """The candidates of a direction, yaw and roll [rad], whose lines run along R's y, `z` along its x [m]."""
-    up, across, ahead = R.T
-    widths = np.maximum(np.abs(field.low), np.abs(field.high))
-    reach = float(np.linalg.norm(widths if angles[1] else widths[:2]))
-    depths = np.arange(-reach, reach, TURNED_DEPTH if angles[1] else DEPTH)
-    lateral = np.arange(-reach, reach, ALONG)
+def _at_height(field: Field, gripper: Gripper, yaw: float, z: float, usual: float) -> Iterator[_Line]:
+    """The candidates of a direction [rad] at a height [m]."""
+    # Of a level line, whatever the tilt.
+    up, across, ahead = axes(yaw, 0.0).T
+    reach = float(np.linalg.norm(np.maximum(np.abs(field.low), np.abs(field.high))[:2]))
+    depths, lateral = np.arange(-reach, reach, DEPTH), np.arange(-reach, reach, ALONG)
     points = depths[:, None, None] * ahead + lateral[None, :, None] * across + z * up
     material = field.at(points) < 0.0
+    places = []
     for row, depth in zip(material, depths, strict=True):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
         starts, stops = edges[::2], edges[1::2]
         for i in range(len(starts)):
             for j in range(i, len(starts)):
                 first, last = lateral[starts[i]], lateral[stops[j] - 1]
-                if last - first > gripper.usable_opening:
-                    continue
-                point = depth * ahead + 0.5 * (first + last) * across + z * up
-                if (closing := _closing(field, gripper, angles, point, usual)) is not None:
-                    yield closing
+                if last - first <= gripper.usable_opening:
+                    places.append(depth * ahead + 0.5 * (first + last) * across + z * up)
+    if not places:
+        return
+    R = np.broadcast_to(axes(yaw, USUAL_TILT), (len(places), 3, 3))
+    for centre, share in zip(*held(field, gripper, R, np.stack(places)), strict=True):
+        if share > 0.0:
+            off_axis, off_height = float(np.linalg.norm(centre[:2])), abs(float(centre[2]) - usual)
+            yield _Line(yaw, centre, min(float(share), ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
 
 
-def _pad_lines(R_body_gripper: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "l 3"]:
+def _pad_lines(R_body_gripper: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch l 3"]:
     """Where lines across the pads start from the point between the finger tips [m]."""
-    x, _, z = R_body_gripper.T
     wide, deep = np.linspace(-PAD, PAD, PAD_LINES), np.linspace(-PAD_BACK, PAD_FRONT, PAD_LINES)
-    return (wide[:, None, None] * x + deep[None, :, None] * z).reshape(-1, 3)
+    places = np.stack(np.meshgrid(wide, deep, indexing="ij"), axis=-1).reshape(-1, 2)
+    return places @ np.swapaxes(R_body_gripper[..., ::2], -1, -2)
 
 
 def between(
-    field: Field, R_body_gripper: Float[np.ndarray, "3 3"], point: Float[np.ndarray, " 3"], opening: float
-) -> tuple[Float[np.ndarray, "l 2"], Float[np.ndarray, "l 3"]]:
+    field: Field, R_body_gripper: Float[np.ndarray, "*batch 3 3"], point: Float[np.ndarray, "*batch 3"], opening: float
+) -> tuple[Float[np.ndarray, "*batch l 2"], Float[np.ndarray, "*batch l 3"]]:
     """What is between open fingers: the first and last material on lines across the pads, from the middle of the
     fingers, NaN where there is none [m]; and where the lines start [m]."""
-    across = R_body_gripper[:, 1]
-    starts = point + _pad_lines(R_body_gripper)
+    across = R_body_gripper[..., None, None, :, 1]
+    starts = point[..., None, :] + _pad_lines(R_body_gripper)
     lateral = np.arange(-opening / 2, opening / 2 + ALONG / 2, ALONG)
-    material = np.less(field.at(starts[:, None] + lateral[None, :, None] * across), 0.0)
-    there = np.any(material, axis=1)
-    ends = np.stack([lateral[material.argmax(axis=1)], lateral[::-1][material[:, ::-1].argmax(axis=1)]], axis=1)
-    return np.where(there[:, None], ends, np.nan), starts
+    material = np.less(field.at(starts[..., None, :] + lateral[:, None] * across), 0.0)
+    there = np.any(material, axis=-1)
+    ends = np.stack([lateral[material.argmax(axis=-1)], lateral[::-1][material[..., ::-1].argmax(axis=-1)]], axis=-1)
+    return np.where(there[..., None], ends, np.nan), starts
 
 
 def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], opening: float) -> tuple[float, float]:
@@ -215,35 +203,46 @@ def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], o
     return float(np.nanmax(ends[:, 1] - ends[:, 0])) / 2, float(np.nanmax(ends[:, 1]) - np.nanmin(ends[:, 0])) / 2
 
 
-def _closing(
-    field: Field, gripper: Gripper, angles: tuple[float, float], point: np.ndarray, usual: float
-) -> _Line | None:
-    """The candidate at a point, moved to the middle between the closed pads; None if the fingers do not hold there."""
-    R = axes(angles[0], USUAL_TILT, angles[1])
-    across = R[:, 1]
-    ends, starts = between(field, R, point, gripper.max_opening)
-    if np.isnan(ends).all():
-        return None
-    rest = np.array([np.nanmin(ends[:, 0]), np.nanmax(ends[:, 1])])
-    if rest[1] - rest[0] > gripper.usable_opening:
-        return None
-    touching = [np.abs(ends[:, side] - rest[side]) < TOUCH for side in (0, 1)]
-    share = min(float(touch.mean()) for touch in touching)
-    if share < LEAST_CONTACT:
-        return None
-    middles = []
-    for side, sign in ((0, -1.0), (1, 1.0)):
-        places = starts[touching[side]] + ends[touching[side], side, None] * across
-        facing = field.slope(places + sign * 0.001 * across) @ (sign * across)
-        if float(np.median(facing)) < math.cos(FACING):
-            return None
-        middles.append(places.mean(axis=0))
-    force = middles[1] - middles[0]
-    if force @ across < math.cos(ALIGNED) * float(np.linalg.norm(force)):
-        return None
-    centre = point + 0.5 * float(rest.sum()) * across
-    off_axis, off_height = float(np.linalg.norm(centre[:2])), abs(float(centre[2]) - usual)
-    return _Line(*angles, centre, min(share, ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
+def held(
+    field: Field,
+    gripper: Gripper,
+    R_body_gripper: Float[np.ndarray, "k 3 3"],
+    point: Float[np.ndarray, "k 3"],
+    askew: float = FACING,
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Where the middle between the closed pads is [m], and which share of the pads' lines touches the body.
+
+    Args:
+      field: of the body.
+      gripper: that grasps.
+      R_body_gripper: how it is turned.
+      point: the middle between the open fingers [m].
+      askew: largest angles between the closing direction and the surface's normal, and the line of the forces [rad].
+
+    Returns:
+      The share is 0 where the fingers do not hold.
+    """
+    across = R_body_gripper[:, :, 1]
+    ends, starts = between(field, R_body_gripper, point, gripper.max_opening)
+    missing = np.isnan(ends)
+    rest = np.stack(
+        [np.where(missing, np.inf, ends).min(axis=1)[:, 0], np.where(missing, -np.inf, ends).max(axis=1)[:, 1]], 1
+    )
+    touching = np.abs(ends - rest[:, None]) < TOUCH
+    share = touching.mean(axis=1).min(axis=1)
+    share[(rest[:, 1] - rest[:, 0] > gripper.usable_opening) | (share < LEAST_CONTACT)] = 0.0
+    some = np.flatnonzero(share)
+    across, touching = across[some], touching[some]
+    places = starts[some, :, None] + ends[some, ..., None] * across[:, None, None]
+    outward = np.array([-1.0, 1.0])[:, None] * across[:, None]
+    facing = np.einsum("klsi,ksi->kls", field.slope(places + 0.001 * outward[:, None]), outward)
+    force = np.diff(np.nanmean(np.where(touching[..., None], places, np.nan), axis=1), axis=1)[:, 0]
+    fails = np.nanmedian(np.where(touching, facing, np.nan), axis=1).min(axis=1) < math.cos(askew)
+    fails |= np.sum(force * across, axis=1) < math.cos(askew) * np.linalg.norm(force, axis=1)
+    share[some[fails]] = 0.0
+    middle = np.zeros(len(share))
+    middle[some] = rest[some].sum(axis=1) / 2
+    return point + middle[:, None] * R_body_gripper[:, :, 1], share
 
 
 def _chosen(
@@ -252,7 +251,7 @@ def _chosen(
     """The best lines that differ, and that the open gripper reaches at some tilt; every direction has its turn."""
     chosen: list[_Line] = []
     allowed: list[tuple[int, ...]] = []
-    boxes = _boxes(gripper)
+    hand = OpenHand.of(gripper)
     left = list(lines)
     used: dict[float, int] = {}
     while left and len(chosen) < most:
@@ -261,14 +260,13 @@ def _chosen(
         left.remove(line)
         if any(_alike(line, other) for other in chosen):
             continue
-        free = tuple(i for i, tilt in enumerate(tilts) if not _meets(line, tilt, body, boxes))
+        free = tuple(i for i, tilt in enumerate(tilts) if hand.too_deep(body, axes(line.yaw, tilt), line.point) == 0.0)
         if free:
             chosen.append(line)
             allowed.append(free)
             used[line.yaw] = used.get(line.yaw, 0) + 1
     return Closings(
         np.array([line.yaw for line in chosen]),
-        np.array([line.roll for line in chosen]),
         np.array([line.point for line in chosen]).reshape(-1, 3),
         tuple(allowed),
     )
@@ -284,30 +282,53 @@ def _alike(a: _Line, b: _Line) -> bool:
     return near and math.cos(a.yaw - b.yaw) > math.cos(ALIKE)
 
 
-def _boxes(gripper: Gripper) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Boxes in or around the hand's and the open fingers' primitives: half-extents [m], and pose in the gripper frame.
+@dataclasses.dataclass(frozen=True, eq=False)
+class OpenHand:
+    """Boxes in or around the hand's and the open fingers' primitives.
 
     Links 6 and 7 are behind the hand, beyond the reach of a body between the fingers.
+
+    Attributes:
+      half: their half-extents [m], shape (b, 3).
+      origin, axes: their centres [m], shape (b, 3), and axes as columns, shape (b, 3, 3), in the gripper's frame.
     """
-    primitives: Sequence[Primitive] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
-    return [(np.maximum(np.array(p.size) - SLACK, 1e-3), p.T_frame_primitive) for p in primitives]
 
+    half: Float[np.ndarray, "b 3"]
+    origin: Float[np.ndarray, "b 3"]
+    axes: Float[np.ndarray, "b 3 3"]
 
-def _meets(
-    line: _Line, tilt: float, body: Float[np.ndarray, "n 3"], boxes: list[tuple[np.ndarray, np.ndarray]]
-) -> bool:
-    """Whether the open gripper meets the body on its straight way in: the way of each surface point, seen from the
-    gripper, ends at it and begins far ahead of it."""
-    local = (body - line.point) @ axes(line.yaw, tilt, line.roll)
-    return any(_swept(local, half, T).any() for half, T in boxes)
+    @classmethod
+    def of(cls, gripper: Gripper) -> OpenHand:
+        """The boxes of a gripper, a little smaller than its parts."""
+        parts: Sequence[Primitive] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
+        T = np.stack([part.T_frame_primitive for part in parts])
+        return cls(np.maximum(np.array([part.size for part in parts]) - SLACK, 1e-3), T[:, :3, 3], T[:, :3, :3])
 
+    @property
+    def corners(self) -> Float[np.ndarray, "c 3"]:
+        """Corners of the boxes in the gripper's frame [m]."""
+        signs = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]], indexing="ij"), axis=-1).reshape(-1, 3)
+        return (self.origin[:, None] + (signs * self.half[:, None]) @ np.swapaxes(self.axes, 1, 2)).reshape(-1, 3)
 
-def _swept(points: Float[np.ndarray, "n 3"], half: np.ndarray, T: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Which points a box has passed through that came along its frame's z from far behind."""
-    origin = (points - T[:3, 3]) @ T[:3, :3]
-    along = T[2, :3]
-    safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
-    a, b = (-half - origin) / safe, (half - origin) / safe
-    near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-    # The point's way relative to the gripper: from far ahead (+z) down to where it is.
-    return (near <= far) & (far >= 0.0)
+    def too_deep(
+        self, body: Float[np.ndarray, "n 3"], R_body_gripper: Float[np.ndarray, "3 3"], point: Float[np.ndarray, " 3"]
+    ) -> float:
+        """How far the open hand must stop short of a point so that it meets the body nowhere on its straight way in.
+
+        The way of each surface point, seen from the gripper, ends at it and begins far ahead of it.
+
+        Args:
+          body: points on its surface [m].
+          R_body_gripper, point: where the gripper closes [m].
+
+        Returns:
+          the distance [m], 0 if it need not.
+        """
+        turned = (body - point) @ R_body_gripper @ np.concatenate(list(self.axes), axis=1)
+        seen = turned.reshape(-1, len(self.half), 3) - np.einsum("bi,bij->bj", self.origin, self.axes)
+        along = self.axes[:, 2]
+        step = 1.0 / np.where(np.abs(along) < 1e-9, 1e-9, along)
+        middle, wide = -seen * step, self.half * np.abs(step)
+        near, far = (middle - wide).max(axis=2), (middle + wide).min(axis=2)
+        # The point's way relative to the gripper: from far ahead (+z) down to where it is.
+        return max(float(np.max(far, where=near <= far, initial=0.0)), 0.0)

@@ -24,8 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from mechsearch_jax.antipodal_grasps import WRISTS, antipodal_grasps
 from mechsearch_jax.candidate_pairs import PIECES_PAIRS, ROUND_PAIRS, filled_up, pair_tables
-from mechsearch_jax.compound_grasps import axes, closings, most_closings
+from mechsearch_jax.compound_grasps import MOST, level_grasps
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
@@ -62,8 +63,8 @@ class GraspConfig:
       still_points: points on the gripper at rest, and on the target, for the crossing with a found target.
       waypoints: number of poses on an approach at which inverse kinematics must succeed.
       erosion: by how much the target is shrunk for the collision test of its way out [m].
-      rolls, steep: for targets of several pieces, angles beside 0 by which the hand is turned about its approach, and
-        more tilts [rad].
+      antipodal: of a target of several pieces, the number of grasps that are spread over all opposite places of its
+        surface, from any side and angle (`antipodal_grasps`); 0 for the best level ones at `tilts` and `wrists` alone.
     """
 
     yaws: int = 7
@@ -79,13 +80,13 @@ class GraspConfig:
     still_points: tuple[int, int] = (512, 128)
     waypoints: int = 4
     erosion: float = 0.001
-    # Not in the representation, which identifies saved problems: those of boxes and cylinders do not depend on them.
-    rolls: tuple[float, ...] = dataclasses.field(default=(), repr=False)
-    steep: tuple[float, ...] = dataclasses.field(default=(), repr=False)
+    antipodal: int = 0
 
     def __post_init__(self):
         if self.yaws < 1 or not self.tilts or not self.wrists:
             raise InputError("GraspConfig: yaws must be at least 1, and tilts and wrists hold at least one angle")
+        if self.antipodal < 0:
+            raise InputError(f"GraspConfig: antipodal {self.antipodal} must not be negative")
         if self.waypoints < 2:
             raise InputError(f"GraspConfig: {self.waypoints} waypoints make no line; use at least 2")
 
@@ -100,8 +101,7 @@ class GraspConfig:
             yaws=25,
             tilts=angles(20.0, 22.5, 25.0, 27.5, 30.0),
             wrists=angles(-60.0, -30.0, 0.0, 30.0, 60.0),
-            rolls=angles(-60.0, -30.0, 30.0, 60.0),
-            steep=angles(40.0, 50.0),
+            antipodal=600,
         )
 
 
@@ -153,10 +153,17 @@ class CandidateGrasps(GraspTables):
     pose_pairs: jax.Array
 
 
-def _target_grasps(
-    target: Target, gripper: Gripper, config: GraspConfig
-) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
-    """`T_target_gripper` of each grasp, and the index of its wrist.
+class _Grasps(NamedTuple):
+    """Grasps of a target, the index of the wrist of each, the angles of the wrists [rad], and the room for grasps."""
+
+    T_target_gripper: Float[Array, "g 4 4"]
+    wrist: Int[np.ndarray, " g"]
+    wrists: tuple[float, ...]
+    room: int
+
+
+def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig) -> _Grasps:
+    """The grasps of a target.
 
     Raises:
       InputError: no grasp fits the target.
@@ -174,7 +181,7 @@ def _target_grasps(
     wrist = grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
     above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
-    return _posed(yaw, tilt, above), wrist
+    return _Grasps(_posed(yaw, tilt, above), wrist, config.wrists, len(wrist))
 
 
 def _posed(yaw: np.ndarray, tilt: np.ndarray, point: np.ndarray) -> Float[Array, "g 4 4"]:
@@ -182,30 +189,24 @@ def _posed(yaw: np.ndarray, tilt: np.ndarray, point: np.ndarray) -> Float[Array,
     return jax.jit(lambda yaw, tilt, point: make(gripper_rotation(yaw, tilt), point))(yaw, tilt, point)
 
 
-def _compound_grasps(
-    target: Target, compound: Compound, gripper: Gripper, config: GraspConfig
-) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
-    """`_target_grasps` of a target of pieces: each closing of `compound_grasps` at the tilts that it allows."""
-    directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
-    yaws = directions.tolist() if target.solid.round else None
-    tilts = (*config.tilts, *config.steep)
-    found = closings(compound, gripper, yaws, tilts, config.height, config.rolls)
-    rows = [
-        (found.yaw[i], tilts[tilt], found.roll[i], wrist, *found.point[i])
-        for i in range(len(found.yaw))
-        for tilt in found.tilts[i]
-        for wrist in range(len(config.wrists))
-    ]
-    if not rows:
+def _compound_grasps(target: Target, compound: Compound, gripper: Gripper, config: GraspConfig) -> _Grasps:
+    """`_target_grasps` of a target of pieces: its `antipodal_grasps` if they are wanted or there are no level ones."""
+    room = config.antipodal or MOST * len(config.tilts) * len(config.wrists)
+    if not config.antipodal:
+        directions = shape_of("cylinder").grasps(target.half_size, config.yaws, config.max_yaw)[0]
+        yaws = directions.tolist() if target.solid.round else None
+        T, wrist = level_grasps(compound, gripper, yaws, config.tilts, len(config.wrists), config.height)
+        if len(T):
+            return _Grasps(jnp.asarray(T, jnp.float32), wrist, config.wrists, room)
+    # Of one that looks alike at every yaw grasps about +x do.
+    widest = config.max_yaw if target.solid.round else math.pi
+    T, wrist = antipodal_grasps(compound, gripper, room, widest)
+    if not len(T):
         raise InputError(
             f"Target: the gripper fits nowhere: it takes {gripper.usable_opening} m between two opposite sides that its"
-            " open fingers reach from the side; use another target"
+            " open fingers reach from the side or from above; use another target"
         )
-    table = np.array(rows)
-    T = np.tile(np.eye(4), (len(table), 1, 1))
-    T[:, :3, :3] = [axes(*angles) for angles in table[:, :3]]
-    T[:, :3, 3] = table[:, 4:]
-    return jnp.asarray(T, jnp.float32), table[:, 3].astype(int)
+    return _Grasps(jnp.asarray(T, jnp.float32), wrist, WRISTS, room)
 
 
 def feasible_grasps(
@@ -236,13 +237,11 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     Raises:
       InputError: the target is too wide for the gripper.
     """
-    T_target_gripper, wrist = _target_grasps(target, gripper, config)
+    T_target_gripper, wrist, wrists, room = _target_grasps(target, gripper, config)
     count = len(wrist)
     if target.is_compound:
-        tilts = len(config.tilts) + len(config.steep)
-        most = most_closings(config.rolls) * tilts * len(config.wrists)
-        T_target_gripper, wrist = filled_up(T_target_gripper, wrist, most)
-    angles = [WRIST_ORIGIN + a for a in config.wrists]
+        T_target_gripper, wrist = filled_up(T_target_gripper, wrist, room)
+    angles = [WRIST_ORIGIN + a for a in wrists]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]
     outward = -np.asarray(T_target_gripper)[:, :3, 2]

@@ -15,7 +15,7 @@ import mechsearch_jax as ms
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.belief import with_target
-from mechsearch_jax.compound_grasps import axes, between, closings, grip_between
+from mechsearch_jax.compound_grasps import between, grip_between
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import existence_tables
 from mechsearch_jax.geometry.superquadric import empty
@@ -134,31 +134,6 @@ def test_a_box_of_one_piece_is_grasped_square_to_its_sides_as_a_box_is():
     ]
     own, usual = ({round(math.degrees(math.atan2(T[1, 2], T[0, 2]))) % 360 for T in each} for each in poses)
     assert own == usual == {0, 90, 180, 270}
-
-
-def test_a_found_target_is_also_taken_by_a_hand_that_is_turned_about_its_approach():
-    # A bar on a foot that slopes up to the side: square to it the fingers are not level.
-    slope = math.radians(30)
-    bar = Piece("box", (0.02, 0.06, 0.015), (0.0, 0.0, 0.07), (math.cos(slope / 2), math.sin(slope / 2), 0.0, 0.0))
-    target = Target.from_parts((bar, Piece("box", (0.045, 0.045, 0.01), (0.0, 0.0, 0.01))))
-    gripper, usual, dense = Gripper(), GraspConfig(), GraspConfig.dense()
-    assert usual.rolls == usual.steep == ()
-    assert target.compound is not None
-    found = closings(target.compound, gripper, None, usual.tilts, usual.height, dense.rolls)
-    level = closings(target.compound, gripper, None, usual.tilts, usual.height)
-    for name in ("yaw", "roll", "point"):
-        np.testing.assert_array_equal(getattr(found, name)[: len(level.yaw)], getattr(level, name))
-    assert (level.roll == 0).all()
-    turned = np.flatnonzero(found.roll)
-    assert len(turned) > 0
-    for i in turned:
-        R = axes(found.yaw[i], usual.tilts[found.tilts[i][0]], found.roll[i])
-        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
-        assert math.degrees(math.asin(abs(R[2, 1]))) > 20
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = R, found.point[i]
-        low, high = grip_between(target.compound, pose, gripper.max_opening)
-        assert 0.001 < low <= high <= gripper.usable_opening / 2 + 2e-3
 
 
 def test_a_target_that_the_gripper_cannot_take_is_refused_in_one_line():

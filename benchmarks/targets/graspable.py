@@ -26,6 +26,7 @@ from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.targets.antipodal import Approaches, gripper_poses, lines
+from mechsearch_jax.candidate_pairs import is_grasp
 from mechsearch_jax.envs.trials.native import Cell, NativeTrials
 from mechsearch_jax.envs.trials.nearby import Nearby
 from mechsearch_jax.envs.world.world import TARGET
@@ -234,7 +235,7 @@ class Bench:
         feasible, choices = jax.device_get(_planned(known, empty(1), jnp.asarray(pose)))
         results = self._tried(target, pose, choices.action, np.asarray(choices.feasible))
         return {
-            "grasps": len(feasible),
+            "grasps": int(is_grasp(known.tables.T_target_gripper).sum()),
             "feasible": int(feasible.sum()),
             "tried": len(results),
             "planner": TrialResult.SUCCEEDED in results,

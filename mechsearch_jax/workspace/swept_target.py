@@ -13,6 +13,8 @@ from mechsearch_jax.workspace.target import Target
 
 # Multiple of the points on a swept target of several pieces that are drawn, since most are in other pieces' ways.
 SPARE = 4
+# Of so many faces of a hull one is looked at first.
+FACES = 16
 
 
 def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
@@ -50,5 +52,9 @@ def _outside(points: Float[np.ndarray, "n 3"], hulls: list[ConvexHull]) -> Float
     """The points that are in none of several convex hulls [m]."""
     inside = np.zeros(len(points), bool)
     for hull in hulls:
-        inside |= np.all(points @ hull.equations[:, :3].T + hull.equations[:, 3] < -1e-4, axis=1)
+        left = np.flatnonzero(~inside)
+        # A few faces tell most points that are outside.
+        for faces in (hull.equations[::FACES], hull.equations):
+            left = left[np.all(points[left] @ faces[:, :3].T + faces[:, 3] < -1e-4, axis=1)]
+        inside[left] = True
     return points[~inside]
