@@ -80,8 +80,8 @@ def _holding(compound: Compound, gripper: Gripper, max_yaw: float) -> Float[np.n
     order = spread(np.hstack([middle / PLACE, (axis[:, :, None] * axis[:, None]).reshape(-1, 9) / AXIS]), LINES)
     found = [np.zeros((0, 4, 4))]
     for start in range(0, len(order), AT_ONCE):
-        some = order[start : start + AT_ONCE]
-        T = _approaches(middle[some], axis[some], max_yaw)
+        rows = order[start : start + AT_ONCE]
+        T = _approaches(middle[rows], axis[rows], max_yaw)
         T = T[_above_board(T, hand.corners, bottom)]
         # A hand whose palm would meet the body stops short of the line.
         back = np.array([hand.too_deep(body[:FEW], pose[:3, :3], pose[:3, 3]) for pose in T])

@@ -231,17 +231,17 @@ def held(
     touching = np.abs(ends - rest[:, None]) < TOUCH
     share = touching.mean(axis=1).min(axis=1)
     share[(rest[:, 1] - rest[:, 0] > gripper.usable_opening) | (share < LEAST_CONTACT)] = 0.0
-    some = np.flatnonzero(share)
-    across, touching = across[some], touching[some]
-    places = starts[some, :, None] + ends[some, ..., None] * across[:, None, None]
+    holding = np.flatnonzero(share)
+    across, touching = across[holding], touching[holding]
+    places = starts[holding, :, None] + ends[holding, ..., None] * across[:, None, None]
     outward = np.array([-1.0, 1.0])[:, None] * across[:, None]
     facing = np.einsum("klsi,ksi->kls", field.slope(places + 0.001 * outward[:, None]), outward)
     force = np.diff(np.nanmean(np.where(touching[..., None], places, np.nan), axis=1), axis=1)[:, 0]
     fails = np.nanmedian(np.where(touching, facing, np.nan), axis=1).min(axis=1) < math.cos(askew)
     fails |= np.sum(force * across, axis=1) < math.cos(askew) * np.linalg.norm(force, axis=1)
-    share[some[fails]] = 0.0
+    share[holding[fails]] = 0.0
     middle = np.zeros(len(share))
-    middle[some] = rest[some].sum(axis=1) / 2
+    middle[holding] = rest[holding].sum(axis=1) / 2
     return point + middle[:, None] * R_body_gripper[:, :, 1], share
 
 

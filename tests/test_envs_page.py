@@ -167,7 +167,8 @@ def test_a_step_shows_the_decision_beside_the_runner_up(text):
     sentences = words(text)
     assert "chosen: push object 0 by 10 cm" in sentences
     assert "runner-up, refused after its trial: push object 0 by 20 cm" in sentences
-    assert f"Predicted: f at {POSES} poses, graspable at {POSES}, J 90. Its sequence changes J by -30.0" in sentences
+    assert f"Predicted: f at {POSES} poses, graspable at {POSES}, J 90. Counting its whole sequence" in sentences
+    assert "and what it may move unseen, J changes by -30.0." in sentences
     assert "J: 100 before, 60 expected, 95 observed. It came out worse than expected." in sentences
 
 

@@ -135,12 +135,12 @@ def test_steps_that_lowered_j_not_or_hardly_are_grey():
     assert "The policy, search-for-grasp, does not mind J." in paragraph(course(0.0, 0.0, 0.0), "Done")
 
 
-def promised(*rows, tried=None):
+def promised(*rows, tried=None, **config):
     """What is said of object 2, in the way of a target that was never found, of candidates at steps like these."""
     steps = [hidden(STEPS[0], sampled=s, action=s.single(0), evidence=evidence(tried=tried)) for s in rows]
     records = tuple(record(PUSH) for _ in steps)
-    recording = of((*steps, hidden(STEPS[1])), (*records, EPISODE.steps[1]), failure="not found", found_step=None)
-    return " ".join(reasons(recording, [2]))
+    ended = {"failure": "not found", "found_step": None, "config": {**EPISODE.config, **config}}
+    return " ".join(reasons(of((*steps, hidden(STEPS[1])), (*records, EPISODE.steps[1]), **ended), [2]))
 
 
 def test_why_what_is_in_the_way_was_not_moved_is_said():
@@ -148,6 +148,11 @@ def test_why_what_is_in_the_way_was_not_moved_is_said():
     counted = "1 of the 4 candidate actions was to move object 2 (none from action 2 on)"
     assert worse.startswith(f"{counted}, each of which was expected to raise J, by at least 36. None of the 2 actions")
     assert worse.endswith("None of the 2 actions was to move object 2, and it stayed where it was.")
+    dear = dataclasses.replace(sampled((0, -9.0), (2, 36.0)), cost=np.array([91.0, 60.0]))
+    counts = "(J would fall from 100 to 60, but that it may touch the hidden target counts as 76)"
+    assert f"expected to raise J, by at least 36 {counts}." in promised(dear, horizon=1)
+    assert "by at least 36." in promised(dear, horizon=3)
+    assert "by at least 36." in promised(sampled((0, -9.0), (2, 36.0)), horizon=1)
     nothing = promised(sampled((0, -9.0), (2, 0.0)))
     assert nothing.startswith(
         "1 of the 2 candidate actions was to move object 2, none of which was expected to lower J."

@@ -122,7 +122,7 @@ def _promised(recording: Recording, since: Sequence[int], k: int, them: str) -> 
         return ""
     i = min(best, key=lambda i: best[i])
     if best[i] > LEAST_GAIN:
-        return f", each of {them} was expected to raise J, by at least {number(best[i])}"
+        return f", each of {them} was expected to raise J, by at least {number(best[i])}{_unseen(recording, i, k)}"
     promising = [j for j in best if best[j] < -LEAST_GAIN]
     if not promising:
         return f", none of {them} was expected to lower J"
@@ -135,6 +135,25 @@ def _promised(recording: Recording, since: Sequence[int], k: int, them: str) -> 
         return f"{words} (action {i + 1})" if early else f"{words}, was action {i + 1}"
     there = f", where {number(max(-chosen[0], 0.0))} was expected of the chosen action" if chosen else ""
     return f"{words} (at step {i + 1}{there})" if early else f"{words}, came at step {i + 1}{there}"
+
+
+def _unseen(recording: Recording, i: int, k: int) -> str:
+    """That the best candidate for an object at a step was expected to lower J, but for what it may move unseen.
+
+    Empty if it was not, and of sequences of several actions, of which only the first one's J is recorded.
+    """
+    episode, kept = recording.episode, recording.steps[i].sampled
+    if episode is None or episode.config.get("horizon") != 1 or (before := episode.steps[i].cost) is None:
+        return ""
+    row = int(np.argmin(np.where(kept.action.object == k, kept.value, np.inf)))
+    after = float(kept.cost[row])
+    if after > before - LEAST_GAIN:
+        return ""
+    price = float(kept.value[row]) - (after - before)
+    return (
+        f" (J would fall from {number(before)} to {number(after)}, but that it may touch the hidden target counts as"
+        f" {number(price)})"
+    )
 
 
 def _trials(recording: Recording, since: Sequence[int], k: int) -> str:
