@@ -68,7 +68,7 @@ class _Line:
 
 
 def axes(yaw: float, tilt: float) -> Float[np.ndarray, "3 3"]:
-    """The gripper's axes as columns: `grasp_frames.gripper_rotation`, in double precision [rad]."""
+    """The gripper's axes as columns: `grasp_frames.gripper_rotation` of angles [rad], in double precision."""
     c, s, cosine, sine = math.cos(yaw), math.sin(yaw), math.cos(tilt), math.sin(tilt)
     return np.array([[c * sine, s, c * cosine], [s * sine, -c, s * cosine], [cosine, 0.0, -sine]])
 

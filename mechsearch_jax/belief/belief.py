@@ -160,7 +160,7 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
 
     The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp. Among
     objects without parts a compound is its largest part alone: an approximation, which only trials in physics make up
-    for. A program of bodies of four parts is twice as large, and takes several times as long.
+    for. A program of bodies of four parts is twice as large.
     """
     T = belief.grasps.T_world_target
     if objects.parts is None:
