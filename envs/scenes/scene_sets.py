@@ -100,7 +100,9 @@ _EXPERIMENTS = (
     # One for each larger change that is reported: a set that was looked at is no longer unseen.
     *(
         SceneSet(f"report-{letter}", "to report with, once", _blocks(f"report-{letter}", 100, (2, 4, 6, 8), first_seed))
-        for letter, first_seed in zip("abcdef", (100_000, 110_000, 120_000, 130_000, 190_000, 200_000), strict=True)
+        for letter, first_seed in zip(
+            "abcdefg", (100_000, 110_000, 120_000, 130_000, 190_000, 200_000, 210_000), strict=True
+        )
     ),
     *(
         SceneSet(f"shelf-{shelf}", about, _blocks(f"shelf-{shelf}", 50, (2, 4, 6, 8), first_seed, shelf=shelf))
