@@ -171,6 +171,22 @@ def test_its_pose_is_found_from_its_visible_points(target):
         assert min(apart, target.turn - apart) < 0.05
 
 
+def test_looks_at_a_target_of_pieces_are_computed_in_batches():
+    """One after the other and in a batch f is the same, also where a closer look decides."""
+    target = coarse_grid(TARGETS["cup"])
+    problem = ms.build_problem(target)
+    scenes = [superquadrics(load_scenario(example_scenarios()[n]).objects) for n in ("crowded-shelf", "first-light")]
+    seen = [
+        Observation(objects=objects, target_visible=jnp.array(False), target_pose=jnp.zeros(3)) for objects in scenes
+    ]
+    looks = [ms.update_belief(problem, ms.initial_belief(problem), one) for one in seen]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
+    batch = jax.jit(jax.vmap(lambda one: ms.update_belief(problem, ms.initial_belief(problem), one)))(both)
+    for i, look in enumerate(looks):
+        np.testing.assert_array_equal(batch.exists[i], look.exists)
+        np.testing.assert_array_equal(batch.allowed[i], look.allowed)
+
+
 @pytest.mark.slow
 def test_a_hidden_and_a_found_target_of_pieces_are_planned_for():
     target = coarse_grid(TARGETS["cup"])

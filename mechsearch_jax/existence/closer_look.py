@@ -92,11 +92,11 @@ def _counted(
     """Pixels at full resolution that a target shows at doubtful places, by a closer look; 0 elsewhere."""
 
     def counted(shared, closer, T):
-        tables, camera = shared
+        tables, camera, target = shared
         return _pixels(tables, camera, target, closer, T, config)
 
     T, mask = tables.T_world_target.reshape(-1, 4, 4), doubtful.reshape(-1)
-    return masked_vmap(counted, mask, (tables, camera), closer, T, block=64).reshape(doubtful.shape)
+    return masked_vmap(counted, mask, (tables, camera, target), closer, T, block=64).reshape(doubtful.shape)
 
 
 def closer_image(
