@@ -29,7 +29,7 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default. Fields of the page are named after them.
-RUNS = ("table1-nearby-h200", "report-f-h200", "collision-free-h200", "report-e-h200")
+RUNS = ("table1-nearby-h200", "report-g-h200", "collision-free-h200", "report-e-h200")
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -205,9 +205,9 @@ def default_rates(table1: StoredRun, report: StoredRun, collision_free: StoredRu
     masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
     grasps = dataclasses.replace(masks, config=usual.config.with_options(retrieval_contact=False))
     new, new_full = (_on_new_scenes(report, method) for method in (usual, full))
-    default = {**_named("`c2` 090 to 179", _on_new_scenes(table1, usual)), **_named("`report-f`", new)}
+    default = {**_named("`c2` 090 to 179", _on_new_scenes(table1, usual)), **_named("`report-g`", new)}
     free = _named("`masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, grasps))
-    seen = _named("`full`, `report-f`", new_full)
+    seen = _named("`full`, `report-g`", new_full)
     return {
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps({**default, **seen}),
