@@ -6,26 +6,28 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 
-from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT
+from mechsearch_jax.envs.simulators.simulator import ROBOT
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf
 
-# The number of a body, or what else may touch one: a part of the robot or of the shelf, in words.
+# The slot of a body, or what else may touch one, in words: a part of the robot or of the shelf.
 Party = int | str
-# Two that touch, in one order only.
+# Two that touch, in either order.
 Touch = frozenset[Party]
 
-# Parts of the shelf in words, by their geometries; what stands on the board touches it anyway.
-WALLS = {
+HAND, ARM = "the hand", "the arm"
+ROBOT_PARTS = (HAND, ARM)
+# Parts of the shelf by their geometries. What stands on the board touches the plane in it, which does not count.
+_SHELF = {
     "back_plane": "the back wall",
     "back_box": "the back wall",
     "left_plane": "the left wall",
@@ -35,32 +37,33 @@ WALLS = {
     "ceiling_box": "the upper board",
     "board_box": "the board",
 }
-HAND, FOREARM = "the hand", "the arm"
+WALLS = frozenset(_SHELF.values())
 _HAND = ("hand", "left_finger", "right_finger")
+# A body that is farther from where it was moves [m]; for so many rows before it may have been touched.
+STIRRED, ROWS_BEFORE = 2e-3, 2
+# What is so near may have touched between two rows [m].
+BESIDE = 0.01
 
 
-@functools.cache
-def _blank(shelf: Shelf) -> mujoco.MjModel:
-    return models.compile_model(shelf, Camera())
-
-
-def touches(shelf: Shelf, bodies: Sequence[Body | None], trace: Trace) -> list[frozenset[Touch]]:
-    """What touches what at each row of a trace; what stands on the board touches it, which does not count.
+def touches(
+    shelf: Shelf, bodies: Sequence[Body | None], trace: Trace, within: float = models.MARGIN
+) -> list[frozenset[Touch]]:
+    """What touches what at each row of a trace.
 
     Args:
       shelf: of the scene.
       bodies: in their slots, the target last.
       trace: of the motion.
+      within: what is so near to each other counts [m]; by default what touches.
     """
-    compounds = models.compounds_in(bodies)
-    blank = models.compile_model(shelf, Camera(), compounds=compounds) if compounds else _blank(shelf)
-    model = models.with_bodies(blank, bodies)
-    parties = _parties(model)
-    data, parked = mujoco.MjData(model), models.initial_state(model, bodies).qpos[ROBOT:].reshape(BODIES, 7)
-    there = np.array([body is not None for body in bodies])
+    model = models.with_bodies(_blank(shelf, bodies), bodies)
+    model.geom_margin[:] = within
+    parties, data = _parties(model), mujoco.MjData(model)
+    parked = models.initial_state(model, bodies).qpos[ROBOT:].reshape(BODIES, 7)
+    there = np.array([body is not None for body in bodies])[:, None]
     rows = []
     for i in range(len(trace.time)):
-        poses = np.where(there[:, None], np.concatenate([trace.position[i], trace.quaternion[i]], axis=1), parked)
+        poses = np.where(there, np.concatenate([trace.position[i], trace.quaternion[i]], axis=1), parked)
         data.qpos[:] = np.concatenate([trace.q[i], trace.fingers[i], poses.reshape(-1)])
         mujoco.mj_fwdPosition(model, data)
         pairs = {frozenset((parties[c.geom1], parties[c.geom2])) for c in data.contact}
@@ -68,12 +71,84 @@ def touches(shelf: Shelf, bodies: Sequence[Body | None], trace: Trace) -> list[f
     return rows
 
 
+def chain(row: Collection[Touch], last: Collection[Party]) -> tuple[Party, ...]:
+    """The shortest chain of things that touch from the robot to one of some parties; empty if there is none."""
+    reached: list[tuple[Party, ...]] = [(part,) for part in ROBOT_PARTS]
+    seen: set[Party] = set(ROBOT_PARTS)
+    for path in reached:
+        beside = {other for pair in row if path[-1] in pair for other in pair - {path[-1]}} - seen
+        for party in sorted(beside, key=str):
+            if party in last:
+                return (*path, party)
+            if isinstance(party, int):
+                reached.append((*path, party))
+                seen.add(party)
+    return ()
+
+
+def knocked(near: Sequence[Collection[Touch]], trace: Trace, victim: int) -> tuple[Party, ...]:
+    """By what the robot moved a body: the robot's part, what it moved first, ..., the body; empty if that is not clear.
+
+    Each but the robot began to move as the one before it was beside it and moved, and not before.
+
+    Args:
+      near: what was beside what at each row of the trace; a row apart, two may meet and part again.
+      trace: of the motion.
+      victim: slot of the body.
+    """
+    moved = np.linalg.norm(trace.position - trace.position[:1], axis=-1) > STIRRED
+    begins = {k: int(np.argmax(moved[:, k])) for k in range(BODIES) if moved[:, k].any()}
+    path: list[Party] = [victim]
+    while isinstance(body := path[0], int):
+        if body not in begins:
+            return ()
+        pairs = set().union(*near[max(begins[body] - ROWS_BEFORE, 0) : begins[body] + 1])
+        beside = [party for pair in pairs if body in pair for party in pair - {body} if party not in path]
+        robot = [party for party in beside if party in ROBOT_PARTS]
+        movers = [k for k in beside if isinstance(k, int) and begins.get(k, BODIES**4) <= begins[body]]
+        if not (robot or movers):
+            return ()
+        path.insert(0, min(robot, key=str) if robot else min(movers, key=lambda k: begins[k]))
+    return tuple(path)
+
+
+def named(party: Party, hidden: bool = False) -> str:
+    """A party in words.
+
+    Args:
+      party: to be named.
+      hidden: whether the robot does not know where the target is.
+    """
+    if party == TARGET:
+        return "the hidden target" if hidden else "the target"
+    return f"object {party}" if isinstance(party, int) else party
+
+
+def pressed(path: Sequence[Party], hidden: bool = False) -> str:
+    """A chain of `chain` in words: "the hand pressed object 0 against the left wall"."""
+    first, *others = path
+    if len(others) == 1:
+        return f"{first} ran into {named(others[0], hidden)}"
+    words = f"{first} pressed {named(others[0], hidden)} against {named(others[1], hidden)}"
+    return words + "".join(f", and that against {named(party, hidden)}" for party in others[2:])
+
+
+@functools.cache
+def _plain(shelf: Shelf) -> mujoco.MjModel:
+    return models.compile_model(shelf, Camera())
+
+
+def _blank(shelf: Shelf, bodies: Sequence[Body | None]) -> mujoco.MjModel:
+    compounds = models.compounds_in(bodies)
+    return models.compile_model(shelf, Camera(), compounds=compounds) if compounds else _plain(shelf)
+
+
 def _parties(model: mujoco.MjModel) -> list[Party | None]:
     """Whose each geometry is; None for the plane that bodies stand on."""
     slots = models.geometry_slots(model)
-    named = []
+    parties: list[Party | None] = []
     for i in range(model.ngeom):
-        name, body = model.geom(i).name, model.body(model.geom_bodyid[i]).name
-        part = HAND if body in _HAND else FOREARM if body.startswith("link") else WALLS.get(name)
-        named.append(int(slots[i]) if slots[i] >= 0 else part)
-    return named
+        body = model.body(model.geom_bodyid[i]).name
+        part = HAND if body in _HAND else ARM if body.startswith("link") else _SHELF.get(model.geom(i).name)
+        parties.append(int(slots[i]) if slots[i] >= 0 else part)
+    return parties
