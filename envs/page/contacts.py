@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -86,13 +86,16 @@ def chain(row: Collection[Touch], last: Collection[Party]) -> tuple[Party, ...]:
     return ()
 
 
-def knocked(near: Sequence[Collection[Touch]], trace: Trace, victim: int) -> tuple[Party, ...]:
+def knocked(
+    rows: Sequence[Collection[Touch]], near: Callable[[], Sequence[Collection[Touch]]], trace: Trace, victim: int
+) -> tuple[Party, ...]:
     """By what the robot moved a body: the robot's part, what it moved first, ..., the body; empty if that is not clear.
 
-    Each but the robot began to move as the one before it was beside it and moved, and not before.
+    Each but the robot began to move as the one before it touched it and moved, and not before.
 
     Args:
-      near: what was beside what at each row of the trace; a row apart, two may meet and part again.
+      rows: what touched what at each row of the trace.
+      near: what was within `BESIDE` of what, for where nothing touched: between two rows things may meet and part.
       trace: of the motion.
       victim: slot of the body.
     """
@@ -102,14 +105,31 @@ def knocked(near: Sequence[Collection[Touch]], trace: Trace, victim: int) -> tup
     while isinstance(body := path[0], int):
         if body not in begins:
             return ()
-        pairs = set().union(*near[max(begins[body] - ROWS_BEFORE, 0) : begins[body] + 1])
-        beside = [party for pair in pairs if body in pair for party in pair - {body} if party not in path]
-        robot = [party for party in beside if party in ROBOT_PARTS]
-        movers = [k for k in beside if isinstance(k, int) and begins.get(k, BODIES**4) <= begins[body]]
-        if not (robot or movers):
+        mover = _mover(rows, begins, body, path)
+        mover = _mover(near(), begins, body, path) if mover is None else mover
+        if mover is None:
             return ()
-        path.insert(0, min(robot, key=str) if robot else min(movers, key=lambda k: begins[k]))
+        path.insert(0, mover)
     return tuple(path)
+
+
+def _mover(
+    rows: Sequence[Collection[Touch]], begins: Mapping[int, int], body: int, known: Sequence[Party]
+) -> Party | None:
+    """What touched a body as it began to move, and moved itself: the robot, or else what moved first; None if nothing.
+
+    Args:
+      rows: what touched what at each row of a trace.
+      begins: the row at which each body began to move.
+      body: its slot.
+      known: what moved later.
+    """
+    pairs = set().union(*rows[max(begins[body] - ROWS_BEFORE, 0) : begins[body] + 1])
+    beside = {party for pair in pairs if body in pair for party in pair - {body}} - set(known)
+    if robot := [part for part in ROBOT_PARTS if part in beside]:
+        return robot[0]
+    movers = [k for k in beside if isinstance(k, int) and k in begins and begins[k] <= begins[body]]
+    return min(movers, key=lambda k: begins[k]) if movers else None
 
 
 def named(party: Party, hidden: bool = False) -> str:

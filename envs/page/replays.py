@@ -101,9 +101,12 @@ def touched(recording: Recording, i: int) -> tuple[frozenset[Touch], ...]:
 def knocks(recording: Recording, i: int, victim: int) -> tuple[Party, ...]:
     """By what the action of a step moved a body; see `contacts.knocked`."""
     step = recording.steps[i]
-    if not len(step.trace.time):
-        return ()
-    return knocked(touches(recording.shelf, bodies_of(step.world), step.trace, BESIDE), step.trace, victim)
+
+    @functools.cache
+    def near() -> list[frozenset[Touch]]:
+        return touches(recording.shelf, bodies_of(step.world), step.trace, BESIDE)
+
+    return knocked(touched(recording, i), near, step.trace, victim) if len(step.trace.time) else ()
 
 
 def _in_words(failure: Failure, action: Action) -> str:
