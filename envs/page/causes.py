@@ -8,9 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-import jax
-import numpy as np
-
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.known_target.in_the_way import numbers_in_words, objects_in_words
 from mechsearch_jax.envs.page import choices, facts, places
@@ -18,7 +15,7 @@ from mechsearch_jax.envs.page.contacts import WALLS, Party, named, pressed
 from mechsearch_jax.envs.page.replays import Stop, knocks, run_stop, touched, trial_stop
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.planner.trials import TrialResult
+from mechsearch_jax.planner.noted_trials import nothing_tried
 
 # A target whose surface is farther from a wall is not said to stand at it [m].
 AT_WALL = 0.04
@@ -49,29 +46,27 @@ def cause(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> 
 def _of_harm(recording: Recording, i: int) -> str:
     """What touched what at the action that ended an episode."""
     step, record = recording.steps[i], None if recording.episode is None else recording.episode.steps[i]
-    if record is None or step.action is None:
+    if recording.episode is None or record is None or step.action is None:
         return ""
     if facts.takes_target(step) and not record.fallen:
         stop = run_stop(recording, i)
-        if stop is None or not stop.path:
-            return ""
-        return f"On the way to the target {pressed(stop.path)}, and {facts.plain(record.failure or '')}."
-    failed = "" if recording.episode is None else recording.episode.failure or ""
+        met = pressed(stop.path) if stop is not None and stop.path else ""
+        return f"As the target was to be taken out, {met}, and {facts.plain(record.failure or '')}." if met else ""
     victim = record.fallen[0] if record.fallen else TARGET
-    fell = "fell over" if victim == TARGET and not record.target_fallen else "fell off the board"
-    if victim == TARGET and "the target fell" not in failed:
+    if victim == TARGET and "the target fell" not in (recording.episode.failure or ""):
         return ""
+    fell = "fell over" if victim == TARGET and not record.target_fallen else "fell off the board"
     path = knocks(recording, i, victim)
-    return f"{_pushed(path, step)}, which {fell}." if path else ""
+    return f"{_pushed(path, step)}, which {fell} (action {i + 1})." if path else ""
 
 
 def _pushed(path: Sequence[Party], step: RecordedStep) -> str:
     """How the robot moved a body, by a chain of `contacts.knocked`, as the begin of a sentence."""
     first, *bodies = (named(party, not step.found) for party in path)
-    action = step.action
-    held = action is not None and kind_of(int(action.kind)).holds_object and path[1] == int(action.object)
+    own = facts.moves_body(step, path[1])
+    held = own and step.action is not None and kind_of(int(step.action.kind)).holds_object
     if len(bodies) == 1:
-        words = f"{first} moved {bodies[0]}" if held or _own(step, path[1]) else f"{first} ran into {bodies[0]}"
+        words = f"{first} {'moved' if held else 'pushed' if own else 'ran into'} {bodies[0]}"
     elif held:
         words = f"{bodies[0]}, in the hand, ran into {bodies[1]}"
     else:
@@ -80,56 +75,59 @@ def _pushed(path: Sequence[Party], step: RecordedStep) -> str:
     return words[0].upper() + words[1:]
 
 
-def _own(step: RecordedStep, k: Party) -> bool:
-    """Whether the action of a step was to move a body."""
-    return step.action is not None and facts.moves(step.action) and int(step.action.object) == k
-
-
 def _no_grasp(recording: Recording) -> str:
     """Where a target stands of which the arm can reach no grasp, and how it came there."""
     last, shelf = recording.steps[-1], recording.shelf
     wall, gap = next(iter(places.walls(shelf, last.world, TARGET).items()))
     at = f"{100 * gap:.0f} cm from {wall}" if gap < AT_WALL else places.area(shelf, last.world.position[TARGET, :2])
-    stuck = " A found target is not pushed in this search." if _never_pushed(recording) else ""
+    never = recording.episode is not None and recording.episode.config.get("move_target") is False
+    stuck = " A target that is found is not pushed in this search." if never else ""
     moved = [i for i in range(len(recording.steps) - 1) if facts.shifts(recording, i)[TARGET] > facts.DISPLACED]
     path = knocks(recording, moved[-1], TARGET) if moved else ()
     if not path:
         return f"The target stands {at}, and there the arm can reach no grasp of it.{stuck}"
-    i, far = moved[-1], facts.shifts(recording, moved[-1])[TARGET]
-    pushed = _pushed(path, recording.steps[i])
-    return (
-        f"{pushed} (action {i + 1}), which then stood {at}, {100 * far:.0f} cm from before:"
-        f" there the arm can reach no grasp of it.{stuck}"
-    )
-
-
-def _never_pushed(recording: Recording) -> bool:
-    return recording.episode is not None and recording.episode.config.get("move_target") is False
+    i, far = moved[-1], float(facts.shifts(recording, moved[-1])[TARGET])
+    moving = f"{_pushed(path, recording.steps[i])}, which it moved by {100 * far:.0f} cm (action {i + 1})"
+    return f"{moving}. There, {at}, the arm can reach no grasp of the target.{stuck}"
 
 
 def _blocked(recording: Recording, obstacles: Sequence[int]) -> str:
     """What is in the way of each grasp of a target, what the hand met there, and why it was not moved."""
-    last = recording.steps[-1]
-    stand = "stands" if len(obstacles) == 1 else "stand"
-    things = objects_in_words(obstacles)
-    at = f" {places.beside_wall(recording.shelf, last.world, obstacles[0])}" if len(obstacles) == 1 else ""
-    words = f"{things[0].upper()}{things[1:]} {stand}{at.rstrip()} in the way of each grasp of the target"
-    met = _met_by_grasps(recording, len(recording.steps) - 1, obstacles)
-    return " ".join(sentence for sentence in (f"{words}{met}.", _not_moved(recording, obstacles)) if sentence)
+    last, one = recording.steps[-1], len(obstacles) == 1
+    at = places.beside_wall(recording.shelf, last.world, obstacles[0]) if one else ""
+    at = f" {at}{_came_there(recording, obstacles[0])}," if at else ""
+    things = objects_in_words(obstacles).capitalize()
+    words = f"{things} {'stands' if one else 'stand'}{at} in the way of each grasp of the target."
+    path, met = _met_by_grasps(recording, len(recording.steps) - 1, obstacles)
+    stayed = _not_moved(recording, obstacles, path)
+    return " ".join(sentence for sentence in (words, met, stayed) if sentence)
 
 
-def _met_by_grasps(recording: Recording, i: int, obstacles: Sequence[int]) -> str:
-    """What the hand met in most trials of taking the target out at a step; empty if that is not clear."""
+def _came_there(recording: Recording, k: int) -> str:
+    """Which action moved an object to where it stands without being to move it since the target was found, in words."""
+    moved = [i for i in range(last_action(recording) + 1) if facts.shifts(recording, i)[k] > facts.DISPLACED]
+    since = facts.since_found(recording)
+    if not moved or any(facts.moves_body(recording.steps[i], k) for i in since):
+        return ""
+    return f", where action {moved[-1] + 1} moved it"
+
+
+def _met_by_grasps(recording: Recording, i: int, obstacles: Sequence[int]) -> tuple[tuple[Party, ...], str]:
+    """What the hand met in most failed trials of taking the target out at a step, also as a sentence; may be empty."""
     stops = trial_stops(recording, [i], None)
-    paths = Counter(stop.path for stop in stops if stop.path and stop.path[1] in obstacles)
-    if not paths:
-        return ""
-    path, count = paths.most_common(1)[0]
-    if count < MOST * len(stops):
-        return ""
-    of = f"in {count} of {len(stops)} trials" if len(stops) > 1 else "in the only trial"
-    every = f"in each of {len(stops)} trials" if count == len(stops) > 1 else of
-    return f": {every} of taking it out at the last look {pressed(path)}, and the arm was held up"
+    paths = Counter(stop.path for stop in stops if len(stop.path) > 1 and stop.path[1] in obstacles)
+    path, count = paths.most_common(1)[0] if paths else ((), 0)
+    if not path or count < MOST * len(stops):
+        return (), ""
+    trials = f"{_among(count, stops)} of taking it out at the last look"
+    return path, f"In {trials} {pressed(path)}, and the arm was held up."
+
+
+def _among(count: int, stops: Sequence[Stop]) -> str:
+    """So many of some failed trials, in words."""
+    if len(stops) == 1:
+        return "the only failed trial"
+    return f"{'each' if count == len(stops) else count} of the {len(stops)} failed trials"
 
 
 def trial_stops(recording: Recording, steps: Sequence[int], k: int | None) -> list[Stop]:
@@ -143,93 +141,98 @@ def trial_stops(recording: Recording, steps: Sequence[int], k: int | None) -> li
     stops = []
     for i in steps:
         evidence = recording.steps[i].evidence
-        for row in range(0 if evidence is None else len(evidence.tried.result)):
-            assert evidence is not None
-            action = jax.tree.map(lambda a, row=row: a[row], evidence.tried.action)
-            taking = kind_of(int(action.kind)).takes_target
-            wanted = taking if k is None else facts.moves(action) and int(action.object) == k
-            stop = trial_stop(recording, i, row) if wanted else None
-            stops += [] if stop is None else [stop]
-    return stops
+        tried = nothing_tried() if evidence is None else evidence.tried
+        for row in range(len(tried.result)):
+            kind, moved = kind_of(int(tried.action.kind[row])), int(tried.action.object[row])
+            if kind.takes_target if k is None else kind.moves_object and moved == k:
+                stops.append(trial_stop(recording, i, row))
+    return [stop for stop in stops if stop is not None]
 
 
 def _hidden(recording: Recording, obstacles: Sequence[int]) -> str:
-    """Behind what a target stands that was never seen, and why that was not moved."""
-    last = recording.steps[-1]
-    at = places.where(recording.shelf, last.world, TARGET)
-    words = f"The target stands {at} behind {objects_in_words(obstacles)}, seen from the camera."
+    """What hides a target that was never seen, and why that was not moved."""
+    at = places.where(recording.shelf, recording.steps[-1].world, TARGET)
+    words = f"The target stands {at}, hidden from the camera by {objects_in_words(obstacles)}."
     return " ".join(sentence for sentence in (words, _not_moved(recording, obstacles)) if sentence)
 
 
-def _not_moved(recording: Recording, obstacles: Sequence[int]) -> str:
-    """Why the first of some objects that can be explained stayed in the way; a sentence, or empty."""
-    for k in obstacles:
-        if words := _stayed(recording, k):
-            return words
-    return ""
+def _not_moved(recording: Recording, obstacles: Sequence[int], met: Sequence[Party] = ()) -> str:
+    """Why the first of some objects of which that is known stayed in the way; empty if it is of none.
+
+    Args:
+      recording: of the episode.
+      obstacles: the objects.
+      met: what the hand met in trials of taking the target out, of which it was said.
+    """
+    return next((words for k in obstacles if (words := _stayed(recording, k, met))), "")
 
 
-def _stayed(recording: Recording, k: int) -> str:
-    """Why an object stayed in the way: what became of moving it, or why nothing could move it."""
-    since = since_found(recording)
-    own = [i for i in since if _own(recording.steps[i], k)]
+def _stayed(recording: Recording, k: int, met: Sequence[Party]) -> str:
+    """What became of moving an object, or why nothing could move it; empty if that is not known."""
+    since = facts.since_found(recording)
+    own = [i for i in since if facts.moves_body(recording.steps[i], k)]
     none = impossible(recording, k)
+    if own and not (none and none[0] < own[0]):
+        return f"{_moved(recording, own, k)}, and it was still in the way."
     stops = trial_stops(recording, since, k)
-    if own and len(own) * 2 > len(none):
-        return _moved_in_vain(recording, own, k, stops)
     if stops and not own:
-        return _never_carried_out(stops, k)
-    parts = [_could_not(recording, none, k)] if none else []
-    if own:
-        far = sum(float(facts.shifts(recording, i)[k]) for i in own)
-        late = ", the last one" if own[0] == last_action(recording) else ""
-        parts.append(f"{actions_in_words(own).capitalize()}{late} moved it, by {100 * far:.0f} cm")
-    return f"{'. '.join(part for part in parts if part)}." if any(parts) else ""
+        (words, path), count = Counter((stop.words, stop.path) for stop in stops).most_common(1)[0]
+        if path and path == met:
+            return f"The same happened in {_among(count, stops)} of moving it."
+        return f"In {_among(count, stops)} of moving it {words}."
+    sentences = [_could_not(recording, none, k, not own), _moved(recording, own, k) if own else ""]
+    return "".join(f"{sentence}. " for sentence in sentences if sentence).rstrip()
 
 
-def _moved_in_vain(recording: Recording, own: Sequence[int], k: int, stops: Sequence[Stop]) -> str:
-    """How far the actions moved an object that were to, and if they pushed it against a wall."""
+def _moved(recording: Recording, own: Sequence[int], k: int) -> str:
+    """How far the actions moved an object that were to, and which wall it met; without an end."""
     far = sum(float(facts.shifts(recording, i)[k]) for i in own)
     met = Counter(wall for i in own for wall in WALLS if any({k, wall} in row for row in touched(recording, i)))
+    acts = facts.actions_in_words(own).capitalize()
+    if far < facts.DISPLACED:
+        return f"{acts} {'was' if len(own) == 1 else 'were'} to move object {k}, and moved it by less than 1 cm"
+    late = ", the last one," if own[0] == last_action(recording) else ""
     wall = f", until it met {met.most_common(1)[0][0]}" if met else ""
-    words = f"{actions_in_words(own).capitalize()} moved object {k} by {100 * far:.0f} cm{' in all' * (len(own) > 1)}"
-    return f"{words}{wall}, and it was still in the way."
+    return f"{acts}{late} moved object {k} by {100 * far:.0f} cm{' in all' if len(own) > 1 else ''}{wall}"
 
 
-def _never_carried_out(stops: Sequence[Stop], k: int) -> str:
-    """How the trials ended that stood against moving an object."""
-    words, count = Counter(stop.words for stop in stops).most_common(1)[0]
-    if len(stops) == 1:
-        return f"In the only failed trial of moving object {k} {words}."
-    every = "each of" if count == len(stops) else f"{count} of"
-    return f"In {every} the {len(stops)} failed trials of moving object {k} {words}."
+def _could_not(recording: Recording, none: Sequence[int], k: int, never: bool) -> str:
+    """Why nothing could move an object at most of some steps, without an end; empty if that is not known.
 
-
-def _could_not(recording: Recording, none: Sequence[int], k: int) -> str:
-    """Why nothing could move an object at some steps; empty if that is not known, or other at most of them."""
-    capacity = recording.steps[-1].scene.capacity
-    known = {i: each for i in none if (each := choices.ways(recording, i, k)) is not None}
-    why = Counter(choices.none_in_words(each, capacity) for each in known.values())
-    why.pop("", None)
-    if not why:
+    Args:
+      recording: of the episode.
+      none: the steps.
+      k: the object.
+      never: whether no action was to move it, so that it is said, too, what spoke against that before.
+    """
+    why = {i: words for i in none if (words := why_none(recording, i, k))}
+    words, count = Counter(why.values()).most_common(1)[0] if why else ("", 0)
+    if not words or count < MOST * len(none):
         return ""
-    words, count = why.most_common(1)[0]
-    if count < MOST * len(none):
-        return ""
-    at = [i for i in known if choices.none_in_words(known[i], capacity) == words]
-    return f"{_when(recording, at)} nothing could move object {k}: {words}{_put_there(recording, at[0], k)}"
+    at = [i for i in why if why[i] == words]
+    could = f"{_when(recording, at)} nothing could move object {k}: {words}{_put_there(recording, at[0], k)}"
+    before = [choices.ways(recording, i, k) for i in facts.since_found(recording) if i < at[0]] if never else []
+    if before and all(each and choices.only_entering(each) for each in before):
+        could += ". Before that, each of its motions passed where the target may be, which costs"
+    return could
+
+
+def why_none(recording: Recording, i: int, k: int) -> str:
+    """Why none of an object's motions was possible at a step, in words; empty if that is not known."""
+    every = choices.ways(recording, i, k)
+    return "" if every is None else choices.none_in_words(every, recording.steps[i].scene.capacity)
 
 
 def _when(recording: Recording, steps: Sequence[int]) -> str:
     """Some steps in words, as the begin of a sentence."""
-    every = [i for i in since_found(recording) if recording.steps[i].action is not None]
+    every = [i for i in facts.since_found(recording) if recording.steps[i].action is not None]
     within = [i for i in every if steps[0] <= i <= steps[-1]]
-    if list(steps) == every:
-        return "At no step"[:2] + " every step"
-    if list(steps) == within and steps[-1] == every[-1] and len(steps) > 1:
+    if list(steps) == every and not every[0]:
+        return "At every step"
+    if list(steps) == within and steps[-1] == every[-1]:
         return f"From action {steps[0] + 1} on"
-    if list(steps) == within and steps[0] == every[0] and len(steps) > 1:
-        return f"Up to action {steps[-1] + 1}"
+    if list(steps) == within and not steps[0]:
+        return f"Before action {steps[-1] + 2}"
     return f"At step{'s' if len(steps) > 1 else ''} {numbers_in_words([i + 1 for i in steps])}"
 
 
@@ -239,42 +242,16 @@ def _put_there(recording: Recording, i: int, k: int) -> str:
     if before is None or now is None or not choices.begun(before):
         return ""
     shifts = facts.shifts(recording, i - 1)
-    moved = [b for each in now for b in each.blockers if b < TARGET and shifts[b] > facts.DISPLACED]
-    return f", where action {i} had put {'it' if len(set(moved)) == 1 else 'them'}" if moved else ""
+    moved = {b for each in now for b in each.blockers if b < TARGET and shifts[b] > facts.DISPLACED}
+    return f"; action {i} had put {objects_in_words(sorted(moved))} there" if moved else ""
 
 
 def impossible(recording: Recording, k: int) -> list[int]:
     """The steps with candidates, none of which was to move an object."""
-    return [
-        i
-        for i in since_found(recording)
-        if len(recording.steps[i].sampled) and not _any_of(recording.steps[i], k)
-    ]
-
-
-def _any_of(step: RecordedStep, k: int) -> bool:
-    """Whether a candidate was to move an object, refused ones included."""
-    refused = step.evidence is not None and any(
-        result <= TrialResult.HARMFUL and int(moved) == k and kind_of(int(kind)).moves_object
-        for result, moved, kind in zip(
-            step.evidence.tried.result.tolist(), step.evidence.tried.action.object, step.evidence.tried.action.kind,
-            strict=True,
-        )
-    )
-    return refused or bool((np.asarray(step.sampled.action.object) == k).any())
-
-
-def since_found(recording: Recording) -> list[int]:
-    """The steps that count for what is in the way at the end: those at which the target was found, or all."""
-    found = recording.steps[-1].found
-    return [i for i, step in enumerate(recording.steps) if step.found == found]
+    every = {i: facts.candidates_of(recording.steps[i]) for i in facts.since_found(recording)}
+    return [i for i, moved in every.items() if moved and all(other != k for other, _ in moved)]
 
 
 def last_action(recording: Recording) -> int:
     """The last step with an action; -1 without one."""
     return max((i for i, step in enumerate(recording.steps) if step.action is not None), default=-1)
-
-
-def actions_in_words(indices: Sequence[int]) -> str:
-    """Actions by their numbers."""
-    return f"{'action' if len(indices) == 1 else 'actions'} {numbers_in_words([i + 1 for i in indices])}"

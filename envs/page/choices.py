@@ -44,7 +44,7 @@ class Ways(NamedTuple):
     Attributes:
       kind: its name.
       able: whether it is among the actions of the search.
-      plausible: number of motions that suit the object: it fits into the hand, or is pushed so low that it stays upright.
+      plausible: number of motions that suit the object: it fits the hand, or is pushed low enough not to tip.
       reached: number of those that the arm can follow, and that meet no wall.
       free: number of those at which hand and object meet nothing.
       entering: number of those that pass where the target may be.
@@ -87,12 +87,12 @@ def none_in_words(ways: Sequence[Ways], capacity: int) -> str:
       capacity: number of objects a scene has room for: the number of the target.
     """
     known = [each for each in ways if each.kind in _NOUNS]
-    if any(each.free for each in known):
+    if begun(known):
         return ""
     words = [_none(each) for each in known if not each.blockers]
     for blockers in dict.fromkeys(each.blockers for each in known if each.blockers):
-        alike = [f"{each.reached} {_noun(each)}" for each in known if each.blockers == blockers]
-        words.append(f"{_blocking(blockers, capacity)} in the way of the {' and '.join(alike)} that the arm can follow")
+        nouns = " and ".join(_NOUNS[each.kind][0] for each in known if each.blockers == blockers)
+        words.append(f"{_blocking(blockers, capacity)} in the way of each {nouns} that the arm can follow")
     return ", and ".join(words)
 
 
@@ -101,25 +101,25 @@ def begun(ways: Sequence[Ways]) -> int:
     return sum(each.free for each in ways)
 
 
-def _noun(ways: Ways) -> str:
-    return _NOUNS[ways.kind][ways.reached != 1]
+def only_entering(ways: Sequence[Ways]) -> bool:
+    """Whether some motions could be begun, and each of these passes where the target may be."""
+    return bool(begun(ways)) and begun(ways) == sum(each.entering for each in ways)
 
 
 def _none(ways: Ways) -> str:
-    _, many = _NOUNS[ways.kind]
+    one, many = _NOUNS[ways.kind]
     if not ways.able:
         return f"{many} are not among the actions"
     if not ways.plausible:
-        return "each push would tip it" if many == "pushes" else "no grasp of it fits the hand"
-    return f"the arm can follow none of its {ways.plausible} {many}"
+        return "each push would tip it" if one == "push" else "no grasp of it fits the hand"
+    return f"the arm can follow no {one} of it"
 
 
 def _blocking(blockers: Sequence[int], capacity: int) -> str:
-    named = [*(str(k) for k in blockers if k < capacity)][:_MOST_NAMED]
-    words = [f"object{'s' if len(named) > 1 else ''} {' or '.join(named)}"] if named else []
+    words = [f"object {k}" for k in blockers if k < capacity][:_MOST_NAMED]
     words += ["the target"] if capacity in blockers else []
-    words += ["others"] if len(blockers) > _MOST_NAMED else []
-    return f"{' or '.join(words)} {'is' if len(blockers) == 1 else 'are'}"
+    words += ["another"] if len(blockers) > len(words) else []
+    return f"{' or '.join(words)} is"
 
 
 def _ways(kind: str, able: bool, candidates: Candidates, k: int) -> Ways:

@@ -10,6 +10,7 @@ import numpy as np
 from mechsearch_jax.envs.episode.protocols import REACHED
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words, objects_in_words
+from mechsearch_jax.envs.page.causes import cause
 from mechsearch_jax.envs.page.facts import (
     DISPLACED,
     blockers,
@@ -35,8 +36,9 @@ class Ending(NamedTuple):
     Attributes:
       good: whether the episode reached what its protocol asks for; None if nothing says so.
       title: in a few words.
-      sentences: what happened, the direct cause of a loss first.
+      sentences: what happened.
       blockers: the objects that the best grasps of the target hit; empty if none does or nothing is known.
+      cause: of a lost target the physical cause; empty if nothing shows one.
       story: of a lost target what was believed, what was done, and why it failed.
       remarks: what happened beside that.
       obstacles: the objects that block or hide a lost target at the last look, the most important first.
@@ -48,6 +50,7 @@ class Ending(NamedTuple):
     title: str
     sentences: list[str]
     blockers: tuple[int, ...]
+    cause: str = ""
     story: Sequence[Paragraph] = ()
     remarks: Sequence[str] = ()
     obstacles: tuple[int, ...] = ()
@@ -57,7 +60,8 @@ class Ending(NamedTuple):
     @property
     def words(self) -> str:
         """All that is said of the end."""
-        return " ".join([*self.sentences, *(paragraph.text for paragraph in self.story), *self.remarks])
+        cause = [self.cause] if self.cause else []
+        return " ".join([*cause, *self.sentences, *(paragraph.text for paragraph in self.story), *self.remarks])
 
 
 def ending(recording: Recording) -> Ending:
@@ -84,6 +88,7 @@ def _lost(recording: Recording, episode: Episode, tips: list[str]) -> Ending:
     still = not any(word in failure for word in ("fell", "error"))
     fatal = None if still and failure.startswith(("found", "not found")) else _fatal(episode, acts)
     obstacles = () if fatal is not None else _obstacles(recording, last)
+    why = cause(recording, fatal, obstacles)
     came = came_into_view(recording)
     if fatal is None:
         decisive = came if came is not None else stalled(recording)
@@ -96,7 +101,8 @@ def _lost(recording: Recording, episode: Episode, tips: list[str]) -> Ending:
         f"Lost: {failure}",
         [_what_happened(recording, episode, acts, obstacles)],
         blockers(last) if still else (),
-        story(recording, fatal, obstacles),
+        why,
+        story(recording, fatal, obstacles, bool(why)),
         _tipped(recording, fatal),
         obstacles,
         decisive,

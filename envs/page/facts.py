@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,11 +13,12 @@ from jaxtyping import Bool, Float
 from mechsearch_jax.actions import KINDS, Action, kind_of
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.episode.records import ActionRecord
-from mechsearch_jax.envs.known_target.in_the_way import blocking
+from mechsearch_jax.envs.known_target.in_the_way import blocking, numbers_in_words
 from mechsearch_jax.envs.page.pictures import hidden_behind, last_world
 from mechsearch_jax.envs.pushing.pushes import toppled
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 
 # Failures of retrievals in the words of a page, and of other actions.
@@ -63,6 +65,38 @@ def moves(action: Action) -> bool:
 def takes_target(step: RecordedStep) -> bool:
     """Whether a step's action is to take the target out."""
     return step.action is not None and kind_of(int(step.action.kind)).takes_target
+
+
+def moves_body(step: RecordedStep, k: int | str) -> bool:
+    """Whether the action of a step is to move a body, by its number."""
+    return step.action is not None and moves(step.action) and int(step.action.object) == k
+
+
+def actions_in_words(indices: Sequence[int]) -> str:
+    """Actions by their numbers."""
+    return f"{'action' if len(indices) == 1 else 'actions'} {numbers_in_words([i + 1 for i in indices])}"
+
+
+def candidates_of(step: RecordedStep) -> list[tuple[int, bool]]:
+    """Of every candidate of a step, refused ones included, the object that it was to move, and if it was refused."""
+    tried = nothing_tried() if step.evidence is None else step.evidence.tried
+    singles = [jax.tree.map(lambda a, k=k: a[k], tried.action) for k in range(len(tried.result))]
+    refused = [
+        action
+        for action, result in zip(singles, tried.result.tolist(), strict=True)
+        if result <= TrialResult.HARMFUL and moves(action)
+    ]
+    left = [step.sampled.single(k) for k in range(len(step.sampled))]
+    if takes_target(step):
+        # A retrieval leaves the sequences as they are, refused ones among them.
+        return [(int(action.object), any(same_motion(action, other) for other in refused)) for action in left]
+    return [(int(action.object), False) for action in left] + [(int(action.object), True) for action in refused]
+
+
+def since_found(recording: Recording) -> list[int]:
+    """The steps that count for what is in the way at the end: those at which the target was found, or else all."""
+    found = recording.steps[-1].found
+    return [i for i, step in enumerate(recording.steps) if step.found == found]
 
 
 def action_words(step: RecordedStep) -> str:

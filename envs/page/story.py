@@ -10,6 +10,7 @@ from jaxtyping import Bool
 
 from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words, objects_in_words
 from mechsearch_jax.envs.page import facts
+from mechsearch_jax.envs.page.places import groups, groups_in_words, possible
 from mechsearch_jax.envs.page.reasons import moved_in_words, reasons
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
@@ -20,15 +21,23 @@ from mechsearch_jax.workspace.shelf import Shelf
 WRONG = 0.02
 # J that falls by no more than this share over the rest of an episode hardly falls; of fewer looks nothing is said.
 HARDLY, FEWEST_LOOKS = 0.05, 3
+# The label of what only adds numbers.
+NUMBERS = "Why not, in numbers"
 # Objects in the way of which it is said why they stayed there, at most.
 MOST_NAMED = 2
 
 
 class Paragraph(NamedTuple):
-    """What stands under a label."""
+    """What stands under a label.
+
+    Attributes:
+      label, sentences: as they are shown.
+      details: whether it only adds numbers to what is said before.
+    """
 
     label: str
     sentences: list[str]
+    details: bool = False
 
     @property
     def text(self) -> str:
@@ -36,19 +45,22 @@ class Paragraph(NamedTuple):
         return " ".join(self.sentences)
 
 
-def story(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> list[Paragraph]:
+def story(
+    recording: Recording, fatal: int | None, obstacles: Sequence[int], explained: bool = False
+) -> list[Paragraph]:
     """What was believed, what was done and why it failed, of a lost target; paragraphs that say nothing are left out.
 
     Args:
       recording: of the episode, with its record.
       fatal: the step whose action did what cannot be mended; None if the target could still have been taken out.
       obstacles: the objects that block or hide it at the last look.
+      explained: whether the physical cause is said before.
     """
     failed = _failed(recording, obstacles) if fatal is None else warned(recording, fatal)
     paragraphs = (
         Paragraph("Believed", _believed(recording, fatal)),
         Paragraph("Done", _done(recording, fatal, obstacles)),
-        Paragraph("Failed because", failed),
+        Paragraph("Failed because", failed) if fatal is not None or not explained else Paragraph(NUMBERS, failed, True),
     )
     return [paragraph for paragraph in paragraphs if paragraph.sentences]
 
@@ -95,8 +107,7 @@ def _costs(recording: Recording) -> list[float]:
 
 def belief_in_words(recording: Recording, step: RecordedStep) -> list[str]:
     """Where a target that is not found was believed to be, whether rightly, and what hides it."""
-    size, poses = int(step.existence.sum()), len(step.existence)
-    sentences = [f"The robot believed that it can be at {size} of {poses} poses{_rightly(recording, step)}."]
+    sentences = [f"The robot believed that it can be {_places(recording, step)}."]
     if facts.believed_elsewhere(step):
         sentences = ["The robot took something else for the target, and looked for it no more."]
     if hiding := facts.hiding(recording, step):
@@ -108,11 +119,28 @@ def _shares(hiding: Sequence[tuple[int, float]]) -> str:
     return " and ".join(f"object {i} ({100 * share:.0f} % of it)" for i, share in hiding)
 
 
+def _places(recording: Recording, step: RecordedStep, first: RecordedStep | None = None) -> str:
+    """Where a target could be in words, and whether rightly.
+
+    Args:
+      recording: of the episode.
+      step: of the belief.
+      first: an earlier step, whose number of places is named if it is another.
+    """
+    can = possible(recording, step)
+    size, count = int(can.sum()), len(can)
+    at_first = int(possible(recording, first).sum()) if first is not None else size
+    before = f" ({at_first} at first)" if at_first != size else ""
+    listed = groups_in_words(groups(recording, step))
+    of = f"{size} of {count} places{before}"
+    return f"{listed}: {of}{_rightly(recording, step)}" if listed else f"at {of}{_rightly(recording, step)}"
+
+
 def _rightly(recording: Recording, step: RecordedStep) -> str:
-    """Whether the true pose is one of those that were thought possible; empty if that is not recorded."""
+    """Whether the true place is one of those that were thought possible; empty if that is not recorded."""
     record = None if recording.episode is None else recording.episode.steps[recording.steps.index(step)]
     right = None if record is None else record.truth_possible
-    return {True: ", its true pose among them", False: ", its true pose not among them", None: ""}[right]
+    return {True: ", the true one among them", False: ", the true one not among them", None: ""}[right]
 
 
 def _believed(recording: Recording, fatal: int | None) -> list[str]:
@@ -120,25 +148,20 @@ def _believed(recording: Recording, fatal: int | None) -> list[str]:
     steps, came = recording.steps, came_into_view(recording)
     last = steps[-1] if fatal is None else steps[fatal]
     if not last.found:
-        first, now = (int(step.existence.sum()) for step in (steps[0], last))
         when = "At the last look" if fatal is None else f"Before action {fatal + 1}"
         if facts.believed_elsewhere(last):
             return [f"{when} the robot took something else for the target, and looked for it no more."]
-        less = f" ({first} at first)" if first != now else ""
         can = "can" if fatal is None else "could"
-        where = f"the robot believed that it {can} be at {now} of {len(last.existence)} poses{less}"
+        sentences = [f"{when} the robot believed that the target {can} be {_places(recording, last, steps[0])}."]
         hidden = facts.hiding(recording, last) if fatal is not None else []
-        behind = f" the target was hidden by {_shares(hidden)};" if hidden else ""
-        return [f"{when}{behind} {where}{_rightly(recording, last)}."]
+        return [*sentences, f"It was hidden by {_shares(hidden)}."] if hidden else sentences
     known = _known(last)
     if came is None:
         return [f"The target was seen at the first look{f'; from then on {known}' if known else ''}."]
-    before = steps[came]
-    hidden = facts.hiding(recording, before)
-    behind = f", hidden by {_shares(hidden)}" if hidden else ""
-    size, poses = int(before.existence.sum()), len(before.existence)
-    where = f"the robot believed that it could be at {size} of {poses} poses{_rightly(recording, before)}"
-    sentences = [f"Up to action {came + 1} the target was not seen{behind}: {where}."]
+    where = f"the robot believed that it could be {_places(recording, steps[came])}"
+    hidden = facts.hiding(recording, steps[came])
+    behind = f"hidden by {_shares(hidden)}" if hidden else "not seen"
+    sentences = [f"Up to action {came + 1} the target was {behind}; {where}."]
     return [*sentences, f"From then on {known}."] if known else sentences
 
 
