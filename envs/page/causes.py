@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from mechsearch_jax.actions import kind_of
-from mechsearch_jax.envs.known_target.in_the_way import numbers_in_words, objects_in_words
+from mechsearch_jax.envs.known_target.in_the_way import least_sets, numbers_in_words, objects_in_words
 from mechsearch_jax.envs.page import choices, facts, places
 from mechsearch_jax.envs.page.contacts import WALLS, Party, named, pressed
 from mechsearch_jax.envs.page.replays import Stop, knocks, run_stop, touched, trial_stop
@@ -23,8 +24,20 @@ AT_WALL = 0.04
 MOST = 0.5
 
 
-def cause(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> str:
-    """Why a target was lost, physically; empty if nothing shows that.
+class Cause(NamedTuple):
+    """Why a target was lost, physically.
+
+    Attributes:
+      words: in one sentence; empty if nothing shows that.
+      evidence: sentences on what shows it.
+    """
+
+    words: str = ""
+    evidence: Sequence[str] = ()
+
+
+def cause(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> Cause:
+    """Why a target was lost, physically.
 
     Args:
       recording: of the episode.
@@ -33,14 +46,14 @@ def cause(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> 
     """
     last = recording.steps[-1]
     if fatal is not None:
-        return _of_harm(recording, fatal)
+        return Cause(_of_harm(recording, fatal))
     if last.evidence is None or facts.believed_elsewhere(last):
-        return ""
+        return Cause()
     if not last.found:
-        return _hidden(recording, obstacles) if obstacles else ""
+        return _hidden(recording, obstacles) if obstacles else Cause()
     if not len(last.evidence.hits):
         return _no_grasp(recording)
-    return _blocked(recording, obstacles) if obstacles else ""
+    return _blocked(recording, obstacles) if obstacles else Cause()
 
 
 def _of_harm(recording: Recording, i: int) -> str:
@@ -75,32 +88,47 @@ def _pushed(path: Sequence[Party], step: RecordedStep) -> str:
     return words[0].upper() + words[1:]
 
 
-def _no_grasp(recording: Recording) -> str:
+def _no_grasp(recording: Recording) -> Cause:
     """Where a target stands of which the arm can reach no grasp, and how it came there."""
     last, shelf = recording.steps[-1], recording.shelf
     wall, gap = next(iter(places.walls(shelf, last.world, TARGET).items()))
     at = f"{100 * gap:.0f} cm from {wall}" if gap < AT_WALL else places.area(shelf, last.world.position[TARGET, :2])
     never = recording.episode is not None and recording.episode.config.get("move_target") is False
-    stuck = " A target that is found is not pushed in this search." if never else ""
+    stuck = ["A target that is found is not pushed in this search."] if never else []
     moved = [i for i in range(len(recording.steps) - 1) if facts.shifts(recording, i)[TARGET] > facts.DISPLACED]
     path = knocks(recording, moved[-1], TARGET) if moved else ()
     if not path:
-        return f"The target stands {at}, and there the arm can reach no grasp of it.{stuck}"
+        return Cause(f"The target stands {at}, and there the arm can reach no grasp of it.", stuck)
     i, far = moved[-1], float(facts.shifts(recording, moved[-1])[TARGET])
-    moving = f"{_pushed(path, recording.steps[i])}, which it moved by {100 * far:.0f} cm (action {i + 1})"
-    return f"{moving}. There, {at}, the arm can reach no grasp of the target.{stuck}"
+    pushed = f"{_pushed(path, recording.steps[i])}, which moved {100 * far:.0f} cm (action {i + 1})"
+    return Cause(f"{pushed}: there, {at}, the arm can reach no grasp of it.", stuck)
 
 
-def _blocked(recording: Recording, obstacles: Sequence[int]) -> str:
+def _blocked(recording: Recording, obstacles: Sequence[int]) -> Cause:
     """What is in the way of each grasp of a target, what the hand met there, and why it was not moved."""
     last, one = recording.steps[-1], len(obstacles) == 1
     at = places.beside_wall(recording.shelf, last.world, obstacles[0]) if one else ""
     at = f" {at}{_came_there(recording, obstacles[0])}," if at else ""
     things = objects_in_words(obstacles).capitalize()
-    words = f"{things} {'stands' if one else 'stand'}{at} in the way of each grasp of the target."
-    path, met = _met_by_grasps(recording, len(recording.steps) - 1, obstacles)
+    words = f"{things} {'stands' if one else 'stand'}{at} in the way of {_grasps(last)}"
+    stops = trial_stops(recording, [len(recording.steps) - 1], None)
+    path, count = _met_by_grasps(stops, obstacles)
     stayed = _not_moved(recording, obstacles, path)
-    return " ".join(sentence for sentence in (words, met, stayed) if sentence)
+    if not path:
+        return Cause(f"{words}{stayed.words}.", stayed.evidence)
+    met = f"reaching for it, {pressed(path, now=True)}, and the arm is held up"
+    so = f"So it was in {_among(count, stops)} of taking the target out at the last look."
+    return Cause(f"{words}: {met}.", [so, *stayed.evidence])
+
+
+def _grasps(step: RecordedStep) -> str:
+    """Which grasps of the target meet the objects that the best ones meet, in words."""
+    assert step.evidence is not None
+    count = len(step.evidence.hits)
+    if len(least_sets(step.evidence.hits)) > 1:
+        return f"the best of the {count} grasps of the target that the arm can reach"
+    which = f"each of the {count} grasps" if count > 1 else "the only grasp"
+    return f"{which} of the target that the arm can reach"
 
 
 def _came_there(recording: Recording, k: int) -> str:
@@ -112,15 +140,11 @@ def _came_there(recording: Recording, k: int) -> str:
     return f", where action {moved[-1] + 1} moved it"
 
 
-def _met_by_grasps(recording: Recording, i: int, obstacles: Sequence[int]) -> tuple[tuple[Party, ...], str]:
-    """What the hand met in most failed trials of taking the target out at a step, also as a sentence; may be empty."""
-    stops = trial_stops(recording, [i], None)
+def _met_by_grasps(stops: Sequence[Stop], obstacles: Sequence[int]) -> tuple[tuple[Party, ...], int]:
+    """What the hand met in most of some failed trials of taking the target out, and in how many; empty if unclear."""
     paths = Counter(stop.path for stop in stops if len(stop.path) > 1 and stop.path[1] in obstacles)
     path, count = paths.most_common(1)[0] if paths else ((), 0)
-    if not path or count < MOST * len(stops):
-        return (), ""
-    trials = f"{_among(count, stops)} of taking it out at the last look"
-    return path, f"In {trials} {pressed(path)}, and the arm was held up."
+    return (path, count) if path and count >= MOST * len(stops) else ((), 0)
 
 
 def _among(count: int, stops: Sequence[Stop]) -> str:
@@ -149,39 +173,46 @@ def trial_stops(recording: Recording, steps: Sequence[int], k: int | None) -> li
     return [stop for stop in stops if stop is not None]
 
 
-def _hidden(recording: Recording, obstacles: Sequence[int]) -> str:
+def _hidden(recording: Recording, obstacles: Sequence[int]) -> Cause:
     """What hides a target that was never seen, and why that was not moved."""
     at = places.where(recording.shelf, recording.steps[-1].world, TARGET)
-    words = f"The target stands {at}, hidden from the camera by {objects_in_words(obstacles)}."
-    return " ".join(sentence for sentence in (words, _not_moved(recording, obstacles)) if sentence)
+    stayed = _not_moved(recording, obstacles, ())
+    words = f"The target stands {at}, hidden from the camera by {objects_in_words(obstacles)}{stayed.words}."
+    return Cause(words, stayed.evidence)
 
 
-def _not_moved(recording: Recording, obstacles: Sequence[int], met: Sequence[Party] = ()) -> str:
-    """Why the first of some objects of which that is known stayed in the way; empty if it is of none.
+def _not_moved(recording: Recording, obstacles: Sequence[int], met: Sequence[Party]) -> Cause:
+    """Why the first of some objects of which that is known stayed in the way: a clause, and what shows it.
 
     Args:
       recording: of the episode.
       obstacles: the objects.
       met: what the hand met in trials of taking the target out, of which it was said.
     """
-    return next((words for k in obstacles if (words := _stayed(recording, k, met))), "")
+    every = (_stayed(recording, k, met) for k in obstacles)
+    return next((each for each in every if each.words or each.evidence), Cause())
 
 
-def _stayed(recording: Recording, k: int, met: Sequence[Party]) -> str:
+def _stayed(recording: Recording, k: int, met: Sequence[Party]) -> Cause:
     """What became of moving an object, or why nothing could move it; empty if that is not known."""
     since = facts.since_found(recording)
     own = [i for i in since if facts.moves_body(recording.steps[i], k)]
     none = impossible(recording, k)
+    moved = [f"{_moved(recording, own, k)}."] if own else []
     if own and not (none and none[0] < own[0]):
-        return f"{_moved(recording, own, k)}, and it was still in the way."
-    stops = trial_stops(recording, since, k)
-    if stops and not own:
+        return Cause("", moved)
+    if not own and (stops := trial_stops(recording, since, k)):
         (words, path), count = Counter((stop.words, stop.path) for stop in stops).most_common(1)[0]
-        if path and path == met:
-            return f"The same happened in {_among(count, stops)} of moving it."
-        return f"In {_among(count, stops)} of moving it {words}."
-    sentences = [_could_not(recording, none, k, not own), _moved(recording, own, k) if own else ""]
-    return "".join(f"{sentence}. " for sentence in sentences if sentence).rstrip()
+        tried = f"{_among(count, stops)} of moving object {k}"
+        return Cause("", [f"So it was in {tried}, too." if path and path == met else f"In {tried} {words}."])
+    at, words = _could_not(recording, none, k)
+    if not words:
+        return Cause("", moved)
+    clause = f", and {_when(recording, at)} nothing could move object {k}: {words}{_put_there(recording, at[0], k)}"
+    before = [choices.ways(recording, i, k) for i in since if i < at[0]]
+    if before and not own and all(each and choices.only_entering(each) for each in before):
+        moved = ["Before that, each of its motions passed where the target may be, which counts against them."]
+    return Cause(clause, moved)
 
 
 def _moved(recording: Recording, own: Sequence[int], k: int) -> str:
@@ -196,25 +227,11 @@ def _moved(recording: Recording, own: Sequence[int], k: int) -> str:
     return f"{acts}{late} moved object {k} by {100 * far:.0f} cm{' in all' if len(own) > 1 else ''}{wall}"
 
 
-def _could_not(recording: Recording, none: Sequence[int], k: int, never: bool) -> str:
-    """Why nothing could move an object at most of some steps, without an end; empty if that is not known.
-
-    Args:
-      recording: of the episode.
-      none: the steps.
-      k: the object.
-      never: whether no action was to move it, so that it is said, too, what spoke against that before.
-    """
+def _could_not(recording: Recording, none: Sequence[int], k: int) -> tuple[list[int], str]:
+    """At which of some steps nothing could move an object, and why at most of them; empty if that is not known."""
     why = {i: words for i in none if (words := why_none(recording, i, k))}
     words, count = Counter(why.values()).most_common(1)[0] if why else ("", 0)
-    if not words or count < MOST * len(none):
-        return ""
-    at = [i for i in why if why[i] == words]
-    could = f"{_when(recording, at)} nothing could move object {k}: {words}{_put_there(recording, at[0], k)}"
-    before = [choices.ways(recording, i, k) for i in facts.since_found(recording) if i < at[0]] if never else []
-    if before and all(each and choices.only_entering(each) for each in before):
-        could += ". Before that, each of its motions passed where the target may be, which costs"
-    return could
+    return ([i for i in why if why[i] == words], words) if words and count >= MOST * len(none) else ([], "")
 
 
 def why_none(recording: Recording, i: int, k: int) -> str:
@@ -224,16 +241,16 @@ def why_none(recording: Recording, i: int, k: int) -> str:
 
 
 def _when(recording: Recording, steps: Sequence[int]) -> str:
-    """Some steps in words, as the begin of a sentence."""
+    """Some steps in words."""
     every = [i for i in facts.since_found(recording) if recording.steps[i].action is not None]
     within = [i for i in every if steps[0] <= i <= steps[-1]]
     if list(steps) == every and not every[0]:
-        return "At every step"
+        return "at every step"
     if list(steps) == within and steps[-1] == every[-1]:
-        return f"From action {steps[0] + 1} on"
+        return f"from action {steps[0] + 1} on"
     if list(steps) == within and not steps[0]:
-        return f"Before action {steps[-1] + 2}"
-    return f"At step{'s' if len(steps) > 1 else ''} {numbers_in_words([i + 1 for i in steps])}"
+        return f"before action {steps[-1] + 2}"
+    return f"at step{'s' if len(steps) > 1 else ''} {numbers_in_words([i + 1 for i in steps])}"
 
 
 def _put_there(recording: Recording, i: int, k: int) -> str:

@@ -144,12 +144,18 @@ def named(party: Party, hidden: bool = False) -> str:
     return f"object {party}" if isinstance(party, int) else party
 
 
-def pressed(path: Sequence[Party], hidden: bool = False) -> str:
-    """A chain of `chain` in words: "the hand pressed object 0 against the left wall"."""
+def pressed(path: Sequence[Party], hidden: bool = False, now: bool = False) -> str:
+    """A chain of `chain` in words: "the hand pressed object 0 against the left wall".
+
+    Args:
+      path: the chain.
+      hidden: whether the robot does not know where the target is.
+      now: in the present tense.
+    """
     first, *others = path
     if len(others) == 1:
-        return f"{first} ran into {named(others[0], hidden)}"
-    words = f"{first} pressed {named(others[0], hidden)} against {named(others[1], hidden)}"
+        return f"{first} {'runs' if now else 'ran'} into {named(others[0], hidden)}"
+    words = f"{first} {'presses' if now else 'pressed'} {named(others[0], hidden)} against {named(others[1], hidden)}"
     return words + "".join(f", and that against {named(party, hidden)}" for party in others[2:])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,14 +21,17 @@ from mechsearch_jax.envs.page.facts import (
     hiding,
     moves,
     plain,
+    stalled,
     takes_target,
     tipped,
 )
 from mechsearch_jax.envs.page.pictures import target_pixels
-from mechsearch_jax.envs.page.story import Paragraph, at_wall, belief_in_words, came_into_view, stalled, story
+from mechsearch_jax.envs.page.story import Paragraph, at_wall, belief_in_words, came_into_view, story
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.workspace.detector import found_pixels
+
+_TRIAL = re.compile(r"\btrials?\b")
 
 
 class Ending(NamedTuple):
@@ -96,18 +100,37 @@ def _lost(recording: Recording, episode: Episode, tips: list[str]) -> Ending:
         believing = came if last.found and came is not None else len(recording.steps) - 1
     else:
         decisive = believing = fatal
+    happened = [*why.evidence, _what_happened(recording, episode, acts, obstacles, bool(why.words))]
+    words, happened, paragraphs = _explained(why.words, happened, story(recording, fatal, obstacles, bool(why.words)))
     return Ending(
         False,
         f"Lost: {failure}",
-        [_what_happened(recording, episode, acts, obstacles)],
+        happened,
         blockers(last) if still else (),
-        why,
-        story(recording, fatal, obstacles, bool(why)),
+        words,
+        paragraphs,
         _tipped(recording, fatal),
         obstacles,
         decisive,
         believing,
     )
+
+
+def _explained(
+    why: str, happened: Sequence[str], paragraphs: Sequence[Paragraph]
+) -> tuple[str, list[str], list[Paragraph]]:
+    """The texts of an end, in which it is said what a trial is where it is spoken of first."""
+    known = False
+
+    def explain(text: str) -> str:
+        nonlocal known
+        if known or not (word := _TRIAL.search(text)):
+            return text
+        known = True
+        return f"{text[: word.end()]} (simulated before acting){text[word.end() :]}"
+
+    first = explain(why), [explain(sentence) for sentence in happened]
+    return *first, [each._replace(sentences=[explain(sentence) for sentence in each.sentences]) for each in paragraphs]
 
 
 def _obstacles(recording: Recording, last: RecordedStep) -> tuple[int, ...]:
@@ -123,17 +146,19 @@ def _seen(episode: Episode) -> str:
     return f"The target was seen {first}"
 
 
-def _what_happened(recording: Recording, episode: Episode, acts: list[int], obstacles: tuple[int, ...]) -> str:
-    """The event that ended an episode without a retrieval, and its direct cause."""
+def _what_happened(
+    recording: Recording, episode: Episode, acts: list[int], obstacles: tuple[int, ...], explained: bool
+) -> str:
+    """The event that ended an episode without a retrieval, and its direct cause, unless that is explained."""
     failure, last = episode.failure or "", recording.steps[-1]
     every, were = ("The only action", "was") if len(acts) == 1 else (f"All {len(acts)} actions", "were")
     used = f"{every} that an episode may have {were} used up"
     if failure == "not found":
-        hidden = f": {objects_in_words(obstacles)} still hid it from the camera" if obstacles else ""
+        hidden = f": {objects_in_words(obstacles)} still hid it from the camera" if obstacles and not explained else ""
         return f"{used}, and the target was never found{hidden}.{_undetected(recording)}"
     if failure == "found, but not graspable":
         hits = None if last.evidence is None else last.evidence.hits
-        met = "" if hits is None or free(hits) else f": at the last look {grasps_in_words(hits)}"
+        met = "" if explained or hits is None or free(hits) else f": at the last look {grasps_in_words(hits)}"
         return f"{used} before any grasp of the target was free{met}."
     fatal = _fatal(episode, acts)
     if fatal is None:

@@ -40,6 +40,9 @@ DISPLACED = 0.01
 # What lowers J by less promises nothing.
 LEAST_GAIN = 0.05
 
+# J that falls by no more than this share over the rest of an episode hardly falls; of fewer looks nothing is said.
+HARDLY, FEWEST_LOOKS = 0.05, 3
+
 
 def plain(failure: str) -> str:
     """A failure in plain words."""
@@ -196,3 +199,37 @@ def blockers(step: RecordedStep) -> tuple[int, ...]:
 def target_is_out(recording: Recording) -> bool:
     """Whether the target is in front of the shelf at the end."""
     return bool(np.asarray(last_world(recording.steps[-1]).position)[TARGET, 0] < recording.shelf.front)
+
+
+def stalled(recording: Recording) -> int | None:
+    """The step from which on J fell no more, or hardly; None if it fell up to the end, or if no J is recorded."""
+    costs = costs_of(recording)
+    for i in range(len(costs) - FEWEST_LOOKS + 1):
+        if costs[i] - min(costs[i:]) <= max(LEAST_GAIN, HARDLY * costs[i]):
+            return i
+    return None
+
+
+def idle(recording: Recording, i: int) -> bool:
+    """Whether a step's action lowered J not, or hardly, or, where J after it was not observed, was not expected to.
+
+    False where that is not recorded, and of a policy that minds no J.
+    """
+    record = None if recording.episode is None else recording.episode.steps[i]
+    if record is None or record.action is None or record.cost is None or not record.compares_costs:
+        return False
+    since = stalled(recording)
+    if record.observed_cost is not None and since is not None and i >= since:
+        return True
+    after = record.predicted_cost if record.observed_cost is None else record.observed_cost
+    return after is not None and after >= record.cost - LEAST_GAIN
+
+
+def costs_of(recording: Recording) -> list[float]:
+    """J at every step before whose action it is recorded, from the first on; empty of a policy that minds none."""
+    costs = []
+    for record in () if recording.episode is None else recording.episode.steps:
+        if record.cost is None or record.action is None or not record.compares_costs:
+            break
+        costs.append(record.cost)
+    return costs

@@ -12,14 +12,19 @@ from mechsearch_jax.envs.page.facts import (
     DISPLACED,
     LEAST_GAIN,
     actions_in_words,
+    believed_elsewhere,
+    blockers,
     candidates_of,
+    idle,
     moves,
     moves_body,
     number,
     same_action,
     shifts,
     since_found,
+    takes_target,
 )
+from mechsearch_jax.envs.page.places import groups, possible
 from mechsearch_jax.envs.page.replays import trial_stop
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
@@ -225,3 +230,46 @@ def moved_in_words(recording: Recording, i: int, target: bool = True) -> str:
     moved = [k for k in np.argsort(-far, kind="stable").tolist() if far[k] > DISPLACED and (target or k != TARGET)]
     named = [f"{'the target' if k == TARGET else f'object {k}'} by {100 * far[k]:.0f} cm" for k in moved]
     return " and ".join([", ".join(named[:-1]), named[-1]] if len(named) > 1 else named)
+
+
+def did_nothing(recording: Recording, i: int) -> str:
+    """Why a step's action did nothing for the search, and why it was chosen all the same; empty if it did something."""
+    step = recording.steps[i]
+    if not idle(recording, i) or step.action is None or takes_target(step):
+        return ""
+    record = None if recording.episode is None else recording.episode.steps[i]
+    fell = record is not None and record.observed_cost is not None and record.observed_cost < (record.cost or 0.0)
+    why = _in_vain(recording, i)
+    chosen = [k for k in range(len(step.sampled)) if same_action(step, step.sampled.action, k)][:1]
+    promised = [float(step.sampled.value[k]) for k in chosen]
+    all_the_same = ""
+    if len(step.sampled) and float(step.sampled.value.min()) >= -LEAST_GAIN:
+        all_the_same = " It was made all the same, as no candidate was expected to lower J."
+    elif promised and promised[0] < -LEAST_GAIN:
+        all_the_same = f" J was expected to fall by {number(-promised[0])}."
+    return (
+        f"It did {'next to ' if fell else ''}nothing for the search{f', because {why}' if why else ''}.{all_the_same}"
+    )
+
+
+def _in_vain(recording: Recording, i: int) -> str:
+    """Why J did not fall by an action, without an end; empty if that is not known."""
+    step, action = recording.steps[i], recording.steps[i].action
+    k = -1 if action is None else int(action.object)
+    if not 0 <= k < step.scene.capacity:
+        return ""
+    if shifts(recording, i)[k] <= DISPLACED:
+        return f"object {k} stayed where it was"
+    if step.found:
+        if not (ways := blockers(step)):
+            return ""
+        return f"object {k} {'is still' if k in ways else 'is not'} in the way of the target’s best grasps"
+    if believed_elsewhere(step):
+        return ""
+    behind = {group.hider: group.count for group in groups(recording, step)}
+    if k not in behind:
+        return f"none of the places where the target can be is behind object {k}"
+    after = recording.steps[i + 1] if i + 1 < len(recording.steps) else None
+    if after is None or after.found or possible(recording, after).sum() < possible(recording, step).sum():
+        return ""
+    return "the target can be at as many places after it as before"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,6 +28,7 @@ from mechsearch_jax.envs.page.facts import (
 )
 from mechsearch_jax.envs.page.pictures import objects_of
 from mechsearch_jax.envs.page.reasons import moved_in_words
+from mechsearch_jax.envs.page.replays import Stop
 from mechsearch_jax.envs.page.story import WRONG
 from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
@@ -39,7 +39,7 @@ from mechsearch_jax.planner.trials import TrialResult
 
 RESULTS = {
     TrialResult.SUCCEEDED: ("good", "went as intended"),
-    TrialResult.FAILED: ("poor", "not carried out as intended: held up, out of reach, or out of the hand"),
+    TrialResult.FAILED: ("poor", "failed; why is not known"),
     TrialResult.HARMFUL: ("bad", "harm: something fell off the board, or the found target fell over"),
     TrialResult.UNSURE: ("poor", "the target was taken out here, but not in every scene nearby"),
     TrialResult.UNKNOWN: ("poor", "no result: it could not be simulated"),
@@ -210,8 +210,13 @@ def _were(count: int) -> str:
     return "was" if count == 1 else "were"
 
 
-def trials(step: RecordedStep) -> list[Trial]:
-    """What was tried out at a step, in order."""
+def trials(step: RecordedStep, stops: Sequence[Stop | None] = ()) -> list[Trial]:
+    """What was tried out at a step, in order; trials that read the same stand where the first of them does.
+
+    Args:
+      step: of the trials.
+      stops: why each of them failed, as far as that is known; may be left out.
+    """
     if step.evidence is None:
         return []
     tried = step.evidence.tried
@@ -228,10 +233,10 @@ def trials(step: RecordedStep) -> list[Trial]:
             failed = "the target was not taken out, here or in a scene nearby"
             words = {TrialResult.UNSURE: words, TrialResult.UNKNOWN: "no result"}.get(result, failed)
             colour, verdict = "poor", "chosen" if made else "passed over"
-        rows.append(Trial(kind.describe(single, step.scene.capacity), words, colour, verdict))
-    # Grasps of the target are alike in words.
-    alike = [(row, len(list(group))) for row, group in itertools.groupby(rows)]
-    return [row._replace(words=f"{row.words}, {count} ways") if count > 1 else row for row, count in alike]
+        stop = stops[k] if stops else None
+        rows.append(Trial(kind.describe(single, step.scene.capacity), stop.words if stop else words, colour, verdict))
+    counts = [(row, rows.count(row)) for row in dict.fromkeys(rows)]
+    return [row._replace(words=f"{row.words}, {count} ways") if count > 1 else row for row, count in counts]
 
 
 def truth(step: RecordedStep, record: Step | None) -> str:

@@ -19,8 +19,6 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 # A target that is believed to be farther than this from where it is counts as wrongly seen [m].
 WRONG = 0.02
-# J that falls by no more than this share over the rest of an episode hardly falls; of fewer looks nothing is said.
-HARDLY, FEWEST_LOOKS = 0.05, 3
 # The label of what only adds numbers.
 NUMBERS = "Why not, in numbers"
 # Objects in the way of which it is said why they stayed there, at most.
@@ -69,40 +67,6 @@ def came_into_view(recording: Recording) -> int | None:
     """The action after which the target was found first; None if it was at the first look, or never."""
     found = [i for i, step in enumerate(recording.steps) if step.found]
     return found[0] - 1 if found and found[0] else None
-
-
-def stalled(recording: Recording) -> int | None:
-    """The step from which on J fell no more, or hardly; None if it fell up to the end, or if no J is recorded."""
-    costs = _costs(recording)
-    for i in range(len(costs) - FEWEST_LOOKS + 1):
-        if costs[i] - min(costs[i:]) <= max(facts.LEAST_GAIN, HARDLY * costs[i]):
-            return i
-    return None
-
-
-def idle(recording: Recording, i: int) -> bool:
-    """Whether a step's action lowered J not, or hardly, or, where J after it was not observed, was not expected to.
-
-    False where that is not recorded, and of a policy that minds no J.
-    """
-    record = None if recording.episode is None else recording.episode.steps[i]
-    if record is None or record.action is None or record.cost is None or not record.compares_costs:
-        return False
-    since = stalled(recording)
-    if record.observed_cost is not None and since is not None and i >= since:
-        return True
-    after = record.predicted_cost if record.observed_cost is None else record.observed_cost
-    return after is not None and after >= record.cost - facts.LEAST_GAIN
-
-
-def _costs(recording: Recording) -> list[float]:
-    """J at every step before whose action it is recorded, from the first on; empty of a policy that minds none."""
-    costs = []
-    for record in () if recording.episode is None else recording.episode.steps:
-        if record.cost is None or record.action is None or not record.compares_costs:
-            break
-        costs.append(record.cost)
-    return costs
 
 
 def belief_in_words(recording: Recording, step: RecordedStep) -> list[str]:
@@ -222,7 +186,7 @@ def _displaced(recording: Recording, came: int | None) -> list[str]:
 
 def _course(recording: Recording) -> list[str]:
     """How J went, and since when it fell no more; empty if that is not recorded."""
-    costs, since, number = _costs(recording), stalled(recording), facts.number
+    costs, since, number = facts.costs_of(recording), facts.stalled(recording), facts.number
     if len(costs) < 2:
         return _mindless(recording)
     if since is None:

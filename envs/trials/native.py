@@ -193,7 +193,10 @@ class NativeTrials:
     def cell_programs(self, cell: Cell) -> list[Program]:
         """`programs` without a problem."""
         nowhere = jax.device_get((empty(TARGET), jnp.zeros(3), jnp.array(False)))
-        return [*motions(self._motion_config(cell)), program("small ones", trial_world, cell.target, cell.shelf, *nowhere)]
+        return [
+            *motions(self._motion_config(cell)),
+            program("small ones", trial_world, *cell[:2], *nowhere),
+        ]
 
     def _motion_config(self, cell: Cell) -> MotionConfig:
         return dataclasses.replace(self.simulation.motion, gripper=cell.gripper)
