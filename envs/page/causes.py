@@ -18,8 +18,6 @@ from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner.noted_trials import nothing_tried
 
-# A target whose surface is farther from a wall is not said to stand at it [m].
-AT_WALL = 0.04
 # What is said of most trials is true of at least this share.
 MOST = 0.5
 
@@ -91,8 +89,7 @@ def _pushed(path: Sequence[Party], step: RecordedStep) -> str:
 def _no_grasp(recording: Recording) -> Cause:
     """Where a target stands of which the arm can reach no grasp, and how it came there."""
     last, shelf = recording.steps[-1], recording.shelf
-    wall, gap = next(iter(places.walls(shelf, last.world, TARGET).items()))
-    at = f"{100 * gap:.0f} cm from {wall}" if gap < AT_WALL else places.area(shelf, last.world.position[TARGET, :2])
+    at = places.where(shelf, last.world, TARGET)
     never = recording.episode is not None and recording.episode.config.get("move_target") is False
     stuck = ["A target that is found is not pushed in this search."] if never else []
     moved = [i for i in range(len(recording.steps) - 1) if facts.shifts(recording, i)[TARGET] > facts.DISPLACED]

@@ -41,12 +41,12 @@ WALLS = frozenset(_SHELF.values())
 _HAND = ("hand", "left_finger", "right_finger")
 # A body that is farther from where it was moves [m]; for so many rows before it may have been touched.
 STIRRED, ROWS_BEFORE = 2e-3, 2
-# What is so near may have touched between two rows [m].
-BESIDE = 0.01
+# What is no farther apart touches, and may have touched between two rows of a trace [m].
+TOUCHING, BESIDE = 2e-4, 0.01
 
 
 def touches(
-    shelf: Shelf, bodies: Sequence[Body | None], trace: Trace, within: float = models.MARGIN
+    shelf: Shelf, bodies: Sequence[Body | None], trace: Trace, within: float = TOUCHING
 ) -> list[frozenset[Touch]]:
     """What touches what at each row of a trace.
 
@@ -54,10 +54,11 @@ def touches(
       shelf: of the scene.
       bodies: in their slots, the target last.
       trace: of the motion.
-      within: what is so near to each other counts [m]; by default what touches.
+      within: what is so near to each other counts [m].
     """
     model = models.with_bodies(_blank(shelf, bodies), bodies)
-    model.geom_margin[:] = within
+    # MuJoCo adds the margins of two geometries, which are smaller than what they stand for.
+    model.geom_margin[:] = models.MARGIN + within / 2
     parties, data = _parties(model), mujoco.MjData(model)
     parked = models.initial_state(model, bodies).qpos[ROBOT:].reshape(BODIES, 7)
     there = np.array([body is not None for body in bodies])[:, None]

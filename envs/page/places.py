@@ -83,13 +83,16 @@ def groups(recording: Recording, step: RecordedStep) -> list[Group]:
 
 
 def groups_in_words(groups: Sequence[Group]) -> str:
-    """Groups of possible places: "behind object 6 (20 places, at the back left) or object 2 (4, at the back)"."""
+    """Groups of possible places: "behind object 6 (20 places, at the back left) or object 2 (4, at the back)".
+
+    Empty if none is behind an object.
+    """
     behind = [group for group in groups if group.hider is not None][:MOST_GROUPS]
     words = [f"object {group.hider} ({_count(group.count, k)}, {group.where})" for k, group in enumerate(behind)]
     others = sum(group.count for group in groups) - sum(group.count for group in behind)
-    words += [f"elsewhere ({_count(others, len(behind))})"] if others else []
+    words += [f"elsewhere ({others})"] if others else []
     listed = " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-    return f"behind {listed}" if behind else listed
+    return f"behind {listed}" if behind else ""
 
 
 def _count(count: int, k: int) -> str:

@@ -91,7 +91,7 @@ def _considered(recording: Recording, since: Sequence[int], k: int, every: str, 
     if not of_it:
         return f"None of {every} was {to}{_why_none(recording, k)}."
     count, refused = sum(map(len, of_it.values())), sum(map(sum, of_it.values()))
-    remarks = [f"{refused} refused after trials"] if refused else []
+    remarks = [f"{refused} refused after simulation"] if refused else []
     remarks += _when_none([i for i in since if rows[i]], list(of_it))
     remarked = f" ({', '.join(remarks)})" if remarks else ""
     promise = _promised(recording, since, k, "the others" if refused else "which") if promised else ""
