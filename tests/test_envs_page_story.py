@@ -254,7 +254,9 @@ def test_a_runner_up_that_reads_the_same_makes_room_for_what_is_in_the_way():
     assert [c.role for c in candidates(step)] == ["chosen"]
     assert [(c.role, c.row) for c in candidates(step, (2,))][1:] == [("best of object 2, in the way at the end", 3)]
     assert [c.role for c in candidates(step, (0,))] == ["chosen"]
-    assert unmoved(step, (1,)) == "No candidate of this step was to move object 1, which is in the way at the end."
+    none = "No candidate of this step was to move object 1, which is in the way at the end"
+    assert unmoved(step, (1,)) == f"{none}; why is not known."
+    assert unmoved(step, (1,), "object 2 is in the way") == f"{none}: object 2 is in the way."
     assert unmoved(step, (2,)) == unmoved(step, ()) == ""
 
 

@@ -59,16 +59,17 @@ def _of_harm(recording: Recording, i: int) -> str:
     step, record = recording.steps[i], None if recording.episode is None else recording.episode.steps[i]
     if recording.episode is None or record is None or step.action is None:
         return ""
-    if facts.takes_target(step) and not record.fallen:
-        stop = run_stop(recording, i)
-        met = pressed(stop.path) if stop is not None and stop.path else ""
-        return f"As the target was to be taken out, {met}, and {facts.plain(record.failure or '')}." if met else ""
+    stop = run_stop(recording, i) if facts.takes_target(step) and not record.fallen else None
+    if stop is not None and stop.path:
+        return f"As the target was to be taken out, {pressed(stop.path)}, and {facts.plain(record.failure or '')}."
     victim = record.fallen[0] if record.fallen else TARGET
     if victim == TARGET and "the target fell" not in (recording.episode.failure or ""):
         return ""
     fell = "fell over" if victim == TARGET and not record.target_fallen else "fell off the board"
     path = knocks(recording, i, victim)
-    return f"{_pushed(path, step)}, which {fell} (action {i + 1})." if path else ""
+    # That the hand touches a target that it grasps says nothing.
+    known = len(path) > 1 + facts.takes_target(step)
+    return f"{_pushed(path, step)}, which {fell} (action {i + 1})." if known else ""
 
 
 def _pushed(path: Sequence[Party], step: RecordedStep) -> str:
@@ -92,13 +93,14 @@ def _no_grasp(recording: Recording) -> Cause:
     at = places.where(shelf, last.world, TARGET)
     never = recording.episode is not None and recording.episode.config.get("move_target") is False
     stuck = ["A target that is found is not pushed in this search."] if never else []
-    moved = [i for i in range(len(recording.steps) - 1) if facts.shifts(recording, i)[TARGET] > facts.DISPLACED]
-    path = knocks(recording, moved[-1], TARGET) if moved else ()
+    had = [i for i, step in enumerate(recording.steps) if step.evidence is not None and len(step.evidence.hits)]
+    i = had[-1] if had else -1
+    far = float(facts.shifts(recording, i)[TARGET]) if had else 0.0
+    path = knocks(recording, i, TARGET) if far > facts.DISPLACED else ()
     if not path:
         return Cause(f"The target stands {at}, and there the arm can reach no grasp of it.", stuck)
-    i, far = moved[-1], float(facts.shifts(recording, moved[-1])[TARGET])
     pushed = f"{_pushed(path, recording.steps[i])}, which moved {100 * far:.0f} cm (action {i + 1})"
-    return Cause(f"{pushed}: there, {at}, the arm can reach no grasp of it.", stuck)
+    return Cause(f"{pushed}; since then the arm can reach no grasp of it: it stands {at}.", stuck)
 
 
 def _blocked(recording: Recording, obstacles: Sequence[int]) -> Cause:
@@ -196,19 +198,23 @@ def _stayed(recording: Recording, k: int, met: Sequence[Party]) -> Cause:
     own = [i for i in since if facts.moves_body(recording.steps[i], k)]
     none = impossible(recording, k)
     moved = [f"{_moved(recording, own, k)}."] if own else []
-    if own and not (none and none[0] < own[0]):
-        return Cause("", moved)
-    if not own and (stops := trial_stops(recording, since, k)):
+    stops = trial_stops(recording, since, k)
+    if stops and not (own and len(stops) == 1):
         (words, path), count = Counter((stop.words, stop.path) for stop in stops).most_common(1)[0]
         tried = f"{_among(count, stops)} of moving object {k}"
-        return Cause("", [f"So it was in {tried}, too." if path and path == met else f"In {tried} {words}."])
+        return Cause("", [*moved, f"So it was in {tried}, too." if path and path == met else f"In {tried} {words}."])
+    if own and not (none and none[0] < own[0]):
+        return Cause("", moved)
     at, words = _could_not(recording, none, k)
     if not words:
         return Cause("", moved)
     clause = f", and {_when(recording, at)} nothing could move object {k}: {words}{_put_there(recording, at[0], k)}"
-    before = [choices.ways(recording, i, k) for i in since if i < at[0]]
-    if before and not own and all(each and choices.only_entering(each) for each in before):
-        moved = ["Before that, each of its motions passed where the target may be, which counts against them."]
+    until = [i for i in since if i not in none and recording.steps[i].action is not None and not (own and i >= own[0])]
+    passing = [i for i in until if (each := choices.ways(recording, i, k)) and choices.only_entering(each)]
+    if passing:
+        when = _when(recording, passing).capitalize()
+        costs = f"{when} each motion that could move it passed where the target may be, which counts against that."
+        moved = [costs, *moved]
     return Cause(clause, moved)
 
 

@@ -127,7 +127,7 @@ def _ways(kind: str, able: bool, candidates: Candidates, k: int) -> Ways:
     plausible = np.asarray(candidates.weight[k] > 0)
     reached = np.asarray(candidates.reached[k]) & plausible[:, None]
     hits, enters = np.asarray(candidates.hits[k]), np.asarray(candidates.enters[k])
-    free = reached & ~hits.any(axis=1)[:, None]
+    free = reached & ~hits.any(axis=1, keepdims=True)
     blockers = () if free.any() else _cover(np.repeat(hits, reached.shape[1], axis=0)[reached.reshape(-1)])
     counts = (int(plausible.sum()) * reached.shape[1], int(reached.sum()), int(free.sum()), int((free & enters).sum()))
     return Ways(kind, able, *counts, blockers)
@@ -135,7 +135,8 @@ def _ways(kind: str, able: bool, candidates: Candidates, k: int) -> Ways:
 
 def _cover(hits: Bool[np.ndarray, "motions n"]) -> tuple[int, ...]:
     """A few objects of which each motion hits one."""
-    left, chosen = hits, []
+    left: np.ndarray = np.asarray(hits)
+    chosen: list[int] = []
     while len(left):
         chosen.append(int(left.sum(axis=0).argmax()))
         left = left[~left[:, chosen[-1]]]
@@ -144,7 +145,9 @@ def _cover(hits: Bool[np.ndarray, "motions n"]) -> tuple[int, ...]:
 
 @functools.lru_cache(maxsize=8)
 def _space(recording: Recording) -> ActionSpace | None:
-    """The actions of a search; None if the record does not hold them all."""
+    """The actions of a search; None if the record does not hold them all, or where bodies have several parts."""
+    if recording.target.is_compound or any(step.scene.parts is not None for step in recording.steps):
+        return None
     options = {} if recording.episode is None else recording.episode.config
     actions = {option.name for option in OPTIONS if option.path[:2] == ("problem", "actions")}
     if not actions <= set(options):

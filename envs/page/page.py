@@ -15,6 +15,7 @@ import jinja2
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.episode.records import load_episode
 from mechsearch_jax.envs.page import steps as texts
+from mechsearch_jax.envs.page.causes import why_none
 from mechsearch_jax.envs.page.ending import Ending, ending
 from mechsearch_jax.envs.page.facts import action_words, executed_words, idle, takes_target, target_is_out, tipped
 from mechsearch_jax.envs.page.pictures import Painter, changed_cells, data_uri, tried_grasp
@@ -243,7 +244,7 @@ def step_words(recording: Recording, i: int, frame: Frame, obstacles: Sequence[i
         "truth": "" if over else texts.truth(step, record),
         "grasps": "" if over else texts.grasps_words(step),
         "candidates": texts.candidates(step, obstacles),
-        "unmoved": texts.unmoved(step, obstacles),
+        "unmoved": texts.unmoved(step, obstacles, why_none(recording, i, obstacles[0]) if obstacles else ""),
         "trials": texts.trials(step, stops),
         "shapes": shapes,
         "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,

@@ -103,7 +103,7 @@ def _count(count: int, k: int) -> str:
 def possible(recording: Recording, step: RecordedStep) -> Bool[np.ndarray, " cells"]:
     """At which places of the grid the target can be, turned in any way."""
     rows, columns = recording.target.grid
-    return np.asarray(step.existence).reshape(rows * columns, -1).any(axis=1)
+    return np.any(np.asarray(step.existence).reshape(rows * columns, -1), axis=1)
 
 
 @functools.lru_cache(maxsize=32)

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from mechsearch_jax.envs.page import causes
+from mechsearch_jax.envs.page.choices import begun, ways
 from mechsearch_jax.envs.page.facts import (
     DISPLACED,
     LEAST_GAIN,
@@ -15,6 +16,7 @@ from mechsearch_jax.envs.page.facts import (
     believed_elsewhere,
     blockers,
     candidates_of,
+    counted,
     idle,
     moves,
     moves_body,
@@ -102,8 +104,12 @@ def _why_none(recording: Recording, k: int) -> str:
     """Why no candidate was to move an object, or that it is not known; of the target, which is not pushed, nothing."""
     if k >= recording.steps[-1].scene.capacity or not (steps := causes.impossible(recording, k)):
         return ""
-    why = causes.why_none(recording, steps[-1], k)
-    return f" (at step {steps[-1] + 1} {why})" if why else " (why is not known)"
+    i = steps[-1]
+    if why := causes.why_none(recording, i, k):
+        return f" (at step {i + 1} {why})"
+    could = begun(ways(recording, i, k) or ())
+    some = f"{counted(could, 'motion')} of it could be begun at step {i + 1}, and " if could else ""
+    return f" ({some}why none was a candidate is not known)"
 
 
 def _when_none(every: list[int], of_it: list[int]) -> list[str]:

@@ -3,6 +3,9 @@
 A recording holds what the trial of an action came to, but not why. A trial in the recorded scene takes 50 ms.
 """
 
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import dataclasses
@@ -18,7 +21,7 @@ import numpy as np
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.page.contacts import ARM, BESIDE, HAND, WALLS, Party, Touch, chain, knocked, pressed, touches
-from mechsearch_jax.envs.page.facts import moves, plain
+from mechsearch_jax.envs.page.facts import action_words, executed_words, moves, plain
 from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recording
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.simulators.trace import Trace
@@ -86,8 +89,16 @@ def run_stop(recording: Recording, i: int) -> Stop | None:
     step, record = recording.steps[i], None if recording.episode is None else recording.episode.steps[i]
     if record is None or step.action is None or not record.failure:
         return None
-    path = _held_up_by(recording, bodies_of(step.world), step.trace, step.action) if record.held_up else ()
+    made = record.held_up and _as_decided(recording, i)
+    path = _held_up_by(recording, bodies_of(step.world), step.trace, step.action) if made else ()
     return Stop(plain(record.failure), path)
+
+
+def _as_decided(recording: Recording, i: int) -> bool:
+    """Whether a step executed what it decided on, with the robot where it is assumed to be."""
+    options = {} if recording.episode is None else recording.episode.config
+    mismatch = any(name.startswith("mismatch.") for name in options)
+    return not mismatch and executed_words(recording, i) == action_words(recording.steps[i])
 
 
 @functools.lru_cache(maxsize=64)
@@ -99,14 +110,16 @@ def touched(recording: Recording, i: int) -> tuple[frozenset[Touch], ...]:
 
 @functools.lru_cache(maxsize=64)
 def knocks(recording: Recording, i: int, victim: int) -> tuple[Party, ...]:
-    """By what the action of a step moved a body; see `contacts.knocked`."""
+    """By what the action of a step moved a body; see `contacts.knocked`. Empty if the robot stood elsewhere."""
     step = recording.steps[i]
 
     @functools.cache
     def near() -> list[frozenset[Touch]]:
         return touches(recording.shelf, bodies_of(step.world), step.trace, BESIDE)
 
-    return knocked(touched(recording, i), near, step.trace, victim) if len(step.trace.time) else ()
+    if not len(step.trace.time) or not _as_decided(recording, i):
+        return ()
+    return knocked(touched(recording, i), near, step.trace, victim)
 
 
 def _in_words(failure: Failure, action: Action) -> str:

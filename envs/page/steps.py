@@ -163,11 +163,18 @@ def candidates(step: RecordedStep, obstacles: Sequence[int] = ()) -> list[Candid
     return shown
 
 
-def unmoved(step: RecordedStep, obstacles: Sequence[int]) -> str:
-    """That no candidate was to move the object that is in the way at the end; empty if one was."""
+def unmoved(step: RecordedStep, obstacles: Sequence[int], why: str = "") -> str:
+    """That no candidate was to move the object that is in the way at the end; empty if one was.
+
+    Args:
+      step: with the decision.
+      obstacles: the objects in the way at the end.
+      why: in words; empty if that is not known.
+    """
     if not obstacles or not len(step.sampled) or (step.sampled.action.object == obstacles[0]).any():
         return ""
-    return f"No candidate of this step was to move object {obstacles[0]}, which is in the way at the end."
+    none = f"No candidate of this step was to move object {obstacles[0]}, which is in the way at the end"
+    return f"{none}: {why}." if why else f"{none}; why is not known."
 
 
 def _alike(one: Candidate, other: Candidate) -> bool:

@@ -12,6 +12,7 @@ from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words, objects
 from mechsearch_jax.envs.page import facts
 from mechsearch_jax.envs.page.places import groups, groups_in_words, possible
 from mechsearch_jax.envs.page.reasons import moved_in_words, reasons
+from mechsearch_jax.envs.page.replays import trial_stop
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner.trials import TrialResult
@@ -249,7 +250,11 @@ def warned(recording: Recording, i: int) -> list[str]:
         went = "In its trial that had not happened: it went as intended" if other else "Its trial had gone as intended"
         return [f"{went}, and nothing fell off the board.", *hidden]
     if result is TrialResult.FAILED:
-        return ["In its trial it was not carried out as intended, but nothing fell.", *hidden]
+        tried = step.evidence.tried.action
+        row = next(k for k in range(len(tried.kind)) if facts.same_action(step, tried, k))
+        stop = trial_stop(recording, i, row)
+        why = "it was not carried out as intended, but nothing fell" if stop is None else stop.words
+        return [f"In its trial {why}.", *hidden]
     return []
 
 

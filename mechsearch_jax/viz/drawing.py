@@ -36,8 +36,8 @@ ACTION = "#1b5fc1"
 TARGET = "#d1344b"
 GRASPABLE = "#2a9d78"
 # The more objects are in the way, the darker. Also who sees no red or no green tells them apart, and from `TARGET`.
-BLOCKED = ("#b9aee6", "#8f7fd6", "#6650b5", "#3e2c78")
-NO_GRASP = "#8b8b86"
+BLOCKED = ("#d3b5e5", "#ad7fd0", "#7f4fa8", "#4c2a6b")
+NO_GRASP = "#c4bfb4"
 # What is in the way, and what is doubtful.
 WARNING = "#f2b100"
 HAND = INK
