@@ -28,7 +28,7 @@ from mechsearch_jax.envs.page.facts import (
 )
 from mechsearch_jax.envs.page.pictures import objects_of
 from mechsearch_jax.envs.page.reasons import moved_in_words
-from mechsearch_jax.envs.page.replays import Stop
+from mechsearch_jax.envs.page.replays import Stop, run_stop
 from mechsearch_jax.envs.page.story import WRONG
 from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
@@ -270,7 +270,9 @@ def troubles(recording: Recording, i: int) -> list[str]:
         return []
     record, after = recording.episode.steps[i], [] if recording.episode.retrieved else recording.steps[i + 1 : i + 2]
     fell = [why for step in after if (why := trouble(recording, step)) and not record.target_fallen]
-    return [*([plain(record.failure)] if record.failure else []), *events(record), *fell]
+    stop = run_stop(recording, i)
+    failed = [plain(record.failure)] if record.failure else []
+    return [*(failed if stop is None else [stop.words]), *events(record), *fell]
 
 
 def came_of_it(recording: Recording, i: int) -> str:
