@@ -290,3 +290,6 @@ def test_an_idle_action_says_why():
     found = dataclasses.replace(STEPS[0], found=True, evidence=evidence(found=True))
     still = dataclasses.replace(recording, steps=(found, moved[1]))
     assert "because object 0 is still in the way of the target’s best grasps." in did_nothing(still, 0)
+    none = dataclasses.replace(found, evidence=dataclasses.replace(found.evidence, hits=found.evidence.hits[:0]))
+    unreached = dataclasses.replace(recording, steps=(none, moved[1]))
+    assert "because the arm can reach no grasp of the target, whatever stands around it." in did_nothing(unreached, 0)

@@ -44,7 +44,7 @@ def cause(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> 
     """
     last = recording.steps[-1]
     if fatal is not None:
-        return Cause(_of_harm(recording, fatal))
+        return Cause(_of_harm(recording, fatal), _unknown(recording, fatal))
     if last.evidence is None or facts.believed_elsewhere(last):
         return Cause()
     if not last.found:
@@ -70,6 +70,16 @@ def _of_harm(recording: Recording, i: int) -> str:
     # That the hand touches a target that it grasps says nothing.
     known = len(path) > 1 + facts.takes_target(step)
     return f"{_pushed(path, step)}, which {fell} (action {i + 1})." if known else ""
+
+
+def _unknown(recording: Recording, i: int) -> list[str]:
+    """That an object was not recognised which the arm met as it was held up, as a sentence; none if all were."""
+    stop, scene = run_stop(recording, i), recording.steps[i].scene
+    path = () if stop is None else stop.path
+    met = sorted(k for k in path if isinstance(k, int) and k < scene.capacity and not scene.valid[k])
+    if not met:
+        return []
+    return [f"{objects_in_words(met).capitalize()} {'was' if len(met) == 1 else 'were'} not recognised at that step."]
 
 
 def _pushed(path: Sequence[Party], step: RecordedStep) -> str:

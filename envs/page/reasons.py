@@ -264,18 +264,21 @@ def _in_vain(recording: Recording, i: int) -> str:
     k = -1 if action is None else int(action.object)
     if not 0 <= k < step.scene.capacity:
         return ""
+    if step.found and step.evidence is not None and not len(step.evidence.hits):
+        return "the arm can reach no grasp of the target, whatever stands around it"
     if shifts(recording, i)[k] <= DISPLACED:
         return f"object {k} stayed where it was"
+    after = recording.steps[i + 1] if i + 1 < len(recording.steps) else None
     if step.found:
-        if not (ways := blockers(step)):
-            return ""
-        return f"object {k} {'is still' if k in ways else 'is not'} in the way of the target’s best grasps"
+        before, now = blockers(step), () if after is None else blockers(after)
+        if before and k not in before:
+            return f"object {k} is not in the way of the target’s best grasps"
+        return f"object {k} is still in the way of the target’s best grasps" if k in now else ""
     if believed_elsewhere(step):
         return ""
     behind = {group.hider: group.count for group in groups(recording, step)}
     if k not in behind:
         return f"none of the places where the target can be is behind object {k}"
-    after = recording.steps[i + 1] if i + 1 < len(recording.steps) else None
     if after is None or after.found or possible(recording, after).sum() < possible(recording, step).sum():
         return ""
     return "the target can be at as many places after it as before"
