@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from stage import BOX, CYLINDER, UPRIGHT
 
 from mechsearch_jax.config.presets import PRESETS
+from mechsearch_jax.envs.page import causes
 from mechsearch_jax.envs.page.causes import cause, why_none
 from mechsearch_jax.envs.page.choices import Ways, begun, none_in_words, only_entering, ways
 from mechsearch_jax.envs.page.contacts import ARM, BESIDE, HAND, WALLS, chain, knocked, pressed, touches
@@ -20,7 +21,7 @@ from mechsearch_jax.envs.page.ending import ending
 from mechsearch_jax.envs.page.page import page
 from mechsearch_jax.envs.page.places import Group, area, beside_wall, groups, groups_in_words, possible, walls, where
 from mechsearch_jax.envs.page.reasons import did_nothing
-from mechsearch_jax.envs.page.replays import run_stop, trial_stop
+from mechsearch_jax.envs.page.replays import Stop, knocks, run_stop, trial_stop
 from mechsearch_jax.envs.page.steps import trials
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.planner.noted_trials import TriedActions
@@ -157,13 +158,102 @@ def test_a_run_that_failed_says_why():
     assert run_stop(LOST, 0) is run_stop(RECORDING, 0) is None
 
 
-def test_what_fell_is_said_to_have_been_moved_by_what_touched_it():
-    # The box moves onto the target; the arm of this trace is far from both, so that nothing moves the box.
-    fell = (record(PUSH, target_fallen=True), EPISODE.steps[1])
-    recording = dataclasses.replace(
-        LOST, episode=dataclasses.replace(EPISODE, steps=fell, failure="the target fell over", found_step=None)
+def fallen(**changes):
+    """A recording of a push at which the hidden target fell off the board."""
+    steps = (record(PUSH, target_fallen=True), EPISODE.steps[1])
+    episode = dataclasses.replace(EPISODE, steps=steps, failure="the target fell over", found_step=None, **changes)
+    return dataclasses.replace(LOST, episode=episode)
+
+
+def test_what_fell_is_said_to_have_been_moved_by_what_touched_it(monkeypatch):
+    # The arm of this trace is far from the box, so that nothing moved it.
+    assert cause(fallen(), 0, ()).words == ""
+    off = "the hidden target, which fell off the board (action 1)."
+    for path, said in (
+        ((HAND, 0, TARGET), f"The hand pushed object 0 into {off}"),
+        ((ARM, 3, 2, TARGET), f"The arm pushed object 3 into object 2, and that into {off}"),
+        ((HAND, TARGET), f"The hand ran into {off}"),
+    ):
+        monkeypatch.setattr(causes, "knocks", lambda *_, path=path: path)
+        assert cause(fallen(), 0, ()).words == said
+    seen = dataclasses.replace(LOST.steps[0], found=True)
+    known = dataclasses.replace(fallen(), steps=(seen, LOST.steps[1]))
+    assert "ran into the target, which fell" in cause(known, 0, ()).words
+
+
+def test_a_robot_that_stood_elsewhere_is_not_said_to_have_touched_anything():
+    moved = fallen(config={**EPISODE.config, "mismatch.base": 0.01})
+    assert knocks(moved, 0, 0) == knocks(moved, 0, TARGET) == ()
+
+
+def test_a_target_that_was_pushed_out_of_reach_is_said_to_have_been(monkeypatch):
+    world = STEPS[1].world
+    position = np.array(world.position)
+    position[TARGET, :2] = SHELF.back - 0.02, 0.1
+    none = dataclasses.replace(evidence(found=True), hits=np.zeros((0, OBJECTS.capacity), bool))
+    last = dataclasses.replace(STEPS[1], world=world.replace(position=position), evidence=none)
+    recording = dataclasses.replace(LOST, steps=(STEPS[0], last))
+    assert cause(recording, None, ()).words.startswith("The target stands against the back wall, and there the arm")
+    monkeypatch.setattr(causes, "knocks", lambda *_: (HAND, 0, TARGET))
+    assert cause(recording, None, ()).words == (
+        "The hand pushed object 0 into the hidden target, which moved 15 cm (action 1); since then the arm can reach no"
+        " grasp of it: it stands against the back wall."
     )
-    assert cause(recording, 0, ()).words == ""
+    assert not cause(recording, None, ()).evidence
+    options = {**EPISODE.config, "move_target": False}
+    fixed = dataclasses.replace(recording, episode=dataclasses.replace(EPISODE, config=options))
+    assert cause(fixed, None, ()).evidence == ["A target that is found is not pushed in this search."]
+
+
+def test_what_the_hand_met_as_it_reached_for_the_target_is_said_with_how_often(monkeypatch):
+    held_up = Stop("the arm was held up", (HAND, 0, "the back wall"))
+    stops = {None: [held_up, held_up, Stop("the hand missed the target")], 0: [held_up]}
+    monkeypatch.setattr(causes, "trial_stops", lambda recording, steps, k: stops[k])
+    said = cause(LOST, None, (0,))
+    assert said.words == (
+        "Object 0 stands in the way of each of the 2 grasps of the target that the arm can reach: reaching for it, the"
+        " hand presses object 0 against the back wall, and the arm is held up."
+    )
+    assert said.evidence == [
+        "So it was in 2 of the 3 failed trials of taking the target out at the last look.",
+        "So it was in the only failed trial of moving object 0, too.",
+    ]
+    # Where most trials ended otherwise, nothing is said of them.
+    stops[None] = [held_up, *[Stop("the hand missed the target")] * 2]
+    assert "reaching for it" not in cause(LOST, None, (0,)).words
+    assert cause(LOST, None, (0,)).evidence == [
+        "In the only failed trial of moving object 0 the arm was held up: the hand pressed object 0 against the back wall."
+    ]
+
+
+def test_since_when_nothing_could_move_what_hides_the_target_and_which_action_had_blocked_it(monkeypatch):
+    free, blocked = Ways("push", True, 30, 4, 4, 4, ()), Ways("push", True, 30, 4, 0, 0, (3,))
+    world = STEPS[0].world
+    position, valid = np.array(world.position), np.array(world.valid)
+    valid[3] = True
+    before, after = (world.replace(position=position + shift, valid=valid) for shift in (0.0, 0.1))
+    other = STEPS[0].sampled
+    other = dataclasses.replace(other, action=other.action.replace(object=np.full(2, 5, np.int32)))
+    step = dataclasses.replace(STEPS[0], sampled=other, action=other.single(0), evidence=evidence(), world=after)
+    first = dataclasses.replace(step, sampled=STEPS[0].sampled, world=before)
+    end = dataclasses.replace(STEPS[1], found=False, evidence=evidence(), world=after)
+    records = (EPISODE.steps[0], EPISODE.steps[0], EPISODE.steps[0], EPISODE.steps[1])
+    recording = dataclasses.replace(
+        LOST, steps=(first, step, step, end), episode=dataclasses.replace(EPISODE, steps=records, failure="not found")
+    )
+    monkeypatch.setattr(causes.choices, "ways", lambda recording, i, k: (blocked,) if i else (free,))
+    said = cause(recording, None, (0,))
+    assert said.words.endswith(
+        "hidden from the camera by object 0, and from action 2 on nothing could move object 0: object 3 is in the way"
+        " of each push that the arm can follow; action 1 had put object 3 there."
+    )
+    (before,) = said.evidence
+    assert before.startswith("Before action 2 each motion that could move it passed where the target may be")
+    # Of what can be begun nothing is said.
+    monkeypatch.setattr(causes.choices, "ways", lambda recording, i, k: (free._replace(entering=0),))
+    assert cause(recording, None, (0,)).words.endswith("hidden from the camera by object 0.")
+    monkeypatch.setattr(causes.choices, "ways", lambda recording, i, k: None)
+    assert cause(recording, None, (0,)).words.endswith("hidden from the camera by object 0.")
 
 
 def test_places_are_named_as_the_robot_sees_them():

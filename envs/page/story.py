@@ -223,7 +223,7 @@ def _fatal_action(recording: Recording, i: int) -> list[str]:
     if moved := moved_in_words(recording, i, target=not facts.takes_target(recording.steps[i])):
         tips = facts.tipped(recording, i)
         over = f", and tipped {objects_in_words(tips)}" if tips else ""
-        sentences.append(f"In the run it moved {moved}{over}.")
+        sentences.append(f"In the run {'it' if sentences else f'action {i + 1}'} moved {moved}{over}.")
     return sentences
 
 
