@@ -222,7 +222,7 @@ def test_what_the_hand_met_as_it_reached_for_the_target_is_said_with_how_often(m
     stops[None] = [held_up, *[Stop("the hand missed the target")] * 2]
     assert "reaching for it" not in cause(LOST, None, (0,)).words
     assert cause(LOST, None, (0,)).evidence == [
-        "In the only failed trial of moving object 0 the arm was held up: the hand pressed object 0 against the back wall."
+        f"In the only failed trial of moving object 0 {held_up.words}."
     ]
 
 
