@@ -221,9 +221,7 @@ def test_what_the_hand_met_as_it_reached_for_the_target_is_said_with_how_often(m
     # Where most trials ended otherwise, nothing is said of them.
     stops[None] = [held_up, *[Stop("the hand missed the target")] * 2]
     assert "reaching for it" not in cause(LOST, None, (0,)).words
-    assert cause(LOST, None, (0,)).evidence == [
-        f"In the only failed trial of moving object 0 {held_up.words}."
-    ]
+    assert cause(LOST, None, (0,)).evidence == [f"In the only failed trial of moving object 0 {held_up.words}."]
 
 
 def test_since_when_nothing_could_move_what_hides_the_target_and_which_action_had_blocked_it(monkeypatch):
