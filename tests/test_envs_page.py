@@ -120,10 +120,11 @@ def test_the_card_says_why_the_target_was_lost(text):
     sentences = words(text)
     assert "Lost: found, but not graspable" in sentences
     # The second grasp hits more than the first.
-    used = "The only action that an episode may have was used up before any grasp of the target was free"
-    hit = "at the last look each of the 2 grasps that the arm can reach inside the shelf hits object 0."
-    assert f"{used}: {hit}" in sentences
-    assert "Orange: in the way" in sentences
+    used = "The only action that an episode may have was used up before any grasp of the target was free."
+    hit = "Object 0 stands in the way of each of the 2 grasps of the target that the arm can reach."
+    assert f"{hit} Action 1 was to move object 0" not in sentences
+    assert f"{hit} {used}" in sentences
+    assert "Yellow: in the way" in sentences
     assert "J was to fall by" not in sentences
     assert "actions 1 of at most 1" in sentences
 
@@ -142,7 +143,7 @@ def test_captions_name_only_what_a_picture_shows(text):
     assert "since the step before" not in words(first)
     assert "What the camera saw." in words(last)
     assert "and the action (hand dark" not in words(last)
-    assert "Red: the target. Orange outline" in words(last)
+    assert "Red: the target. Yellow: in the way" in words(last)
     taken = dataclasses.replace(STEPS[1], action=RETRIEVAL)
     _, last = page(dataclasses.replace(LOST, steps=(STEPS[0], taken))).split('<section class="step"')[1:]
     assert "(hand dark; red, dashed: the target on its way out)" in words(last)
@@ -283,15 +284,16 @@ def test_endings_name_what_happened():
     fell = of("an object fell off the board at action 1", (record(PUSH, fallen=(2,)), EPISODE.steps[1]))
     assert fell.title == "Lost: an object fell off the board at action 1"
     assert "Object 2 fell off the board at action 1, “push object 0 by 10 cm" in fell.sentences[0]
-    assert "Its trial had gone as intended, and nothing fell off the board." in fell.words
+    assert "Its trial (simulated before acting) had gone as intended, and nothing fell off the board." in fell.words
     assert not fell.blockers
     toppled = of("the target fell over", (record(PUSH, target_fallen=True), EPISODE.steps[1]))
     assert toppled.sentences[0].startswith("The target fell over at action 1, “push object 0")
     unseen = of("not found", recorded=(STEPS[0], dataclasses.replace(STEPS[1], found=False, evidence=evidence())))
-    assert unseen.sentences[0].endswith("and the target was never found: object 0 still hid it from the camera.")
-    assert f"of {POSES} poses, its true pose among them." in unseen.words
+    assert unseen.sentences[-1].endswith("and the target was never found.")
+    assert unseen.cause.endswith("hidden from the camera by object 0.")
+    assert f"of {POSES} places, the true one among them." in unseen.words
     # The best was also chosen.
-    moved = "3 of the 3 candidate actions were to move object 0 (1 refused after trials); the best was expected to "
+    moved = "3 of the 3 candidate actions were to move object 0 (1 refused after simulation); the best was expected to "
     assert f"{moved}lower J by 30 (action 1)." in unseen.words
     taking = dataclasses.replace(STEPS[1], action=RETRIEVAL)
     missed = of("retrieval: missed", (EPISODE.steps[0], record(RETRIEVAL, found=True)), (STEPS[0], taking))
@@ -321,12 +323,13 @@ def test_candidates_that_trials_refused_are_counted_once():
     kept = STEPS[0].sampled
     of_others = dataclasses.replace(kept, action=kept.action.replace(object=np.full(2, 3, np.int32)))
     refused = lost("not found", tried=tried, sampled=of_others).words
-    assert "1 of the 4 candidate actions was to move object 0 (1 refused after trials)" in refused
-    assert "None of the 2 candidate actions was to move object 0." in lost("not found", sampled=of_others).words
+    assert "1 of the 4 candidate actions was to move object 0 (1 refused after simulation)" in refused
+    none = lost("not found", sampled=of_others).words
+    assert "None of the 2 candidate actions was to move object 0 (why none was a candidate is not known)." in none
     # The sequences of a retrieval hold those that were refused.
     twice = TriedActions(stacked(PUSH, FAR), np.array([TrialResult.HARMFUL, TrialResult.FAILED], np.int32))
     taking = lost("not found", tried=twice, action=RETRIEVAL).words
-    assert "2 of the 2 candidate actions were to move object 0 (1 refused after trials)" in taking
+    assert "2 of the 2 candidate actions were to move object 0 (1 refused after simulation" in taking
 
 
 def test_a_push_that_fails_is_no_grasp():
@@ -444,7 +447,9 @@ def test_a_target_that_no_grasp_reaches_is_said_to_be_near_a_wall():
     none = dataclasses.replace(evidence(found=True), hits=np.zeros((0, SLOTS), bool))
     last = dataclasses.replace(STEPS[1], world=world.replace(position=position), evidence=none)
     said = ending(dataclasses.replace(LOST, steps=(STEPS[0], last))).words
-    assert "at the last look the arm can reach no grasp of the target inside the shelf." in said
+    assert said.startswith(
+        "The target stands against the back wall, and there the arm can reach no grasp of it. The only "
+    )
     assert "after it none: the target’s middle is 2.0 cm from the back wall, and was" in said
     position[TARGET, :2] = 0.6, RECORDING.shelf.left - 0.03
     last = dataclasses.replace(last, world=world.replace(position=position))
@@ -514,7 +519,7 @@ def test_the_hand_of_a_grasp_that_was_tried_is_drawn_where_the_search_ends():
     np.testing.assert_array_equal(tried_grasp(last).T_world_gripper, RETRIEVAL.T_world_gripper)
     assert tried_grasp(STEPS[1]) is None
     assert tried_grasp(dataclasses.replace(last, action=PUSH)) is None
-    said = "Orange, dashed: the hand at the first grasp that had a trial."
+    said = "Dark, dashed: the hand at the first grasp that had a trial."
     assert words(page(dataclasses.replace(LOST, steps=(STEPS[0], last)))).count(said) == 2
     assert said not in words(page(LOST))
     recording = dataclasses.replace(LOST, steps=(STEPS[0], last))

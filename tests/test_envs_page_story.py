@@ -9,10 +9,11 @@ from recordings import EPISODE, FAR, LOST, OBJECTS, POSES, PUSH, RECORDING, RETR
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.page.ending import ending
+from mechsearch_jax.envs.page.facts import idle, stalled
 from mechsearch_jax.envs.page.page import page
 from mechsearch_jax.envs.page.reasons import moved_in_words, reasons
 from mechsearch_jax.envs.page.steps import came_of_it, candidates, label, over, troubles, unmoved
-from mechsearch_jax.envs.page.story import came_into_view, idle, stalled
+from mechsearch_jax.envs.page.story import NUMBERS, came_into_view
 from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner.noted_trials import TriedActions
@@ -67,7 +68,7 @@ def test_the_direct_cause_comes_first():
     assert [p.label for p in fell.story] == ["Believed", "Done", "Failed because"]
     assert (fell.decisive, fell.believing) == (0, 0)
     failed = fell.story[-1].text
-    assert failed.startswith("In its trial that had not happened: it went as intended")
+    assert failed.startswith("In its trial (simulated before acting) that had not happened: it went as intended")
     assert re.search(r"The target was hidden then, its middle \d+ cm from that of object 0, and a trial knows", failed)
     last = (record(PUSH, failure="dropped"), EPISODE.steps[1])
     assert ending(of(STEPS, last, failure="dropped")).sentences[0].endswith("”: object 0 slipped out of the hand.")
@@ -75,8 +76,10 @@ def test_the_direct_cause_comes_first():
 
 def test_what_was_believed_is_said_wherever_the_target_was_found():
     later = paragraph(LOST, "Believed")
-    assert later.startswith("Up to action 1 the target was not seen, hidden by object 0 (100 % of it): the robot ")
-    assert later.endswith(f"of {POSES} poses, its true pose among them. From then on its place was known.")
+    assert later.startswith(
+        "Up to action 1 the target was hidden by object 0 (100 % of it); the robot believed that it "
+    )
+    assert later.endswith(f"of {POSES} places, the true one among them. From then on its place was known.")
     first = dataclasses.replace(STEPS[0], found=True, evidence=evidence(found=True))
     at_once = paragraph(of((first, STEPS[1]), found_step=0), "Believed")
     assert at_once == "The target was seen at the first look; from then on its place was known."
@@ -88,7 +91,8 @@ def test_what_was_believed_is_said_wherever_the_target_was_found():
     assert "took something else for the target" in paragraph(lost, "Believed")
     falls = of(STEPS, (record(PUSH, target_fallen=True), EPISODE.steps[1]), failure="the target fell over")
     believed = paragraph(falls, "Believed")
-    assert believed.startswith("Before action 1 the target was hidden by object 0 (100 % of it); the robot believed ")
+    assert believed.startswith("Before action 1 the robot believed that the target could be at ")
+    assert believed.endswith("It was hidden by object 0 (100 % of it).")
 
 
 def test_the_action_that_brought_the_target_into_view_and_left_its_blocker_is_named():
@@ -159,7 +163,7 @@ def test_why_what_is_in_the_way_was_not_moved_is_said():
     )
     tried = TriedActions(stacked(PUSH.replace(object=np.int32(2))), np.array([TrialResult.HARMFUL], np.int32))
     others = promised(sampled((0, -9.0), (2, 0.0)), tried=tried)
-    assert "(1 refused after trials), none of the others was expected to lower J." in others
+    assert "(1 refused after simulation), none of the others was expected to lower J." in others
     less = promised(sampled((0, -9.0), (2, -2.0)))
     assert "; the best was expected to lower J by 2.0 (at step 1, where 9.0 was expected of the chosen action)." in less
     late = promised(sampled((0, -9.0), (2, 3.0)), sampled((2, -4.0), (0, -3.0)))
@@ -174,7 +178,7 @@ def test_trials_that_stood_against_moving_it_are_counted():
         return promised(sampled((0, -9.0), (2, -2.0)), tried=tried)
 
     failed, harmful, good = TrialResult.FAILED, TrialResult.HARMFUL, TrialResult.SUCCEEDED
-    why = "(held up, out of reach, or out of the hand)"
+    why = "(why is not known)"
     assert f"The only trial of moving object 2 failed {why}." in of_results(failed)
     assert f"All 2 trials of moving object 2 failed {why}." in of_results(failed, failed)
     assert f"Of 3 trials of moving object 2, 1 failed {why} and 1 did harm" in of_results(failed, harmful, good)
@@ -200,16 +204,16 @@ def test_what_an_action_moved_along_is_not_hidden():
 
 def test_where_the_arm_can_reach_no_grasp_any_more_it_is_said_since_when():
     none = dataclasses.replace(evidence(found=True), hits=np.zeros((0, OBJECTS.capacity), bool))
-    said = paragraph(of((STEPS[0], dataclasses.replace(STEPS[1], evidence=none))), "Failed because")
+    said = paragraph(of((STEPS[0], dataclasses.replace(STEPS[1], evidence=none))), NUMBERS)
     assert said.startswith(
         "Before action 1 the arm could reach 2 grasps of it, each of which hit something; after it none"
     )
-    assert "a trial knows nothing of what is hidden" in said
+    assert "a trial (simulated before acting) knows nothing of what is hidden" in said
     clear = hidden(STEPS[0], evidence=evidence(hits=((), (0,))))
-    said = paragraph(of((clear, dataclasses.replace(STEPS[1], evidence=none))), "Failed because")
+    said = paragraph(of((clear, dataclasses.replace(STEPS[1], evidence=none))), NUMBERS)
     assert "2 grasps of it, 1 of which hit nothing" in said
     never = tuple(dataclasses.replace(step, evidence=none, found=True) for step in STEPS)
-    said = paragraph(of(never, found_step=0), "Failed because")
+    said = paragraph(of(never, found_step=0), NUMBERS)
     assert said.startswith("At the last look the target’s middle is")
     assert said.endswith("None of the 2 candidate actions since it was seen was to push the target itself.")
 
@@ -250,7 +254,9 @@ def test_a_runner_up_that_reads_the_same_makes_room_for_what_is_in_the_way():
     assert [c.role for c in candidates(step)] == ["chosen"]
     assert [(c.role, c.row) for c in candidates(step, (2,))][1:] == [("best of object 2, in the way at the end", 3)]
     assert [c.role for c in candidates(step, (0,))] == ["chosen"]
-    assert unmoved(step, (1,)) == "No candidate of this step was to move object 1, which is in the way at the end."
+    none = "No candidate of this step was to move object 1, which is in the way at the end"
+    assert unmoved(step, (1,)) == f"{none}; why is not known."
+    assert unmoved(step, (1,), "object 2 is in the way") == f"{none}: object 2 is in the way."
     assert unmoved(step, (2,)) == unmoved(step, ()) == ""
 
 

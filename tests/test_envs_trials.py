@@ -79,7 +79,7 @@ def results_of(model, problem, seen, at, found, actions, wanted=None):
 def world_of(problem, objects):
     """What is simulated of a scene whose target is not found."""
     seen, at = objects_and_pose(problem, objects)
-    return jax.device_get(native._world(problem.target, problem.shelf, seen, at, jnp.array(False)))
+    return jax.device_get(native.trial_world(problem.target, problem.shelf, seen, at, jnp.array(False)))
 
 
 @functools.cache

@@ -245,10 +245,10 @@ def test_images_are_recognised_by_one_program_for_both(two):
 
 def test_bodies_of_trials_are_compiled_once_for_both_shelves():
     pose, is_found = jnp.zeros(3), jnp.array(True)
-    worlds = [native._world(TARGET, shelf, OBJECTS, pose, is_found) for shelf in (SHELF, SHELF)]
-    size = cache_size(native._world)
-    worlds.append(native._world(TARGET, MOVED, OBJECTS, pose, is_found))
-    assert cache_size(native._world) == size
+    worlds = [native.trial_world(TARGET, shelf, OBJECTS, pose, is_found) for shelf in (SHELF, SHELF)]
+    size = cache_size(native.trial_world)
+    worlds.append(native.trial_world(TARGET, MOVED, OBJECTS, pose, is_found))
+    assert cache_size(native.trial_world) == size
     heights = [float(world.position[-1, 2]) for world in worlds]
     assert heights[0] == heights[1]
     assert heights[2] - heights[0] == pytest.approx(MOVED.board - SHELF.board, abs=1e-6)

@@ -243,6 +243,29 @@ def test_a_map_shows_the_best_of_the_possible_yaw_angles():
     assert image[0, 0, 3] < 0.9
 
 
+# What somebody without red or green cones sees of linear red, green and blue: Machado et al., 2009.
+SEEN = {
+    "all": np.eye(3),
+    "no red": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "no green": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+}
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+@pytest.mark.parametrize("eyes", SEEN)
+def test_colours_that_stand_for_different_things_differ_for_everybody(eyes):
+    colours = [drawing.GRASPABLE, *drawing.BLOCKED, drawing.NO_GRASP, drawing.TARGET, drawing.WARNING]
+    linear = np.array([drawing.rgb(colour) for colour in colours])
+    linear = np.where(linear > 0.04045, ((linear + 0.055) / 1.055) ** 2.4, linear / 12.92)
+    xyz = np.clip(linear @ np.array(SEEN[eyes]).T, 0, 1) @ TO_XYZ.T / TO_XYZ.sum(axis=1)
+    root = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    lightness, ab = 116 * root[:, 1] - 16, np.array([500, 200]) * -np.diff(root, axis=1)
+    lab = np.column_stack([lightness, ab])
+    apart = np.linalg.norm(lab[:, None] - lab[None], axis=-1) + 100 * np.eye(len(colours))
+    # CIELAB; about 2 is just seen.
+    assert apart.min() > 15
+
+
 def test_every_value_of_g_has_one_colour():
     bands = drawing.bands()
     for g in range(-30, 2):

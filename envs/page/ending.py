@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from mechsearch_jax.envs.episode.protocols import REACHED
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words, objects_in_words
+from mechsearch_jax.envs.page.causes import cause
 from mechsearch_jax.envs.page.facts import (
     DISPLACED,
     blockers,
@@ -19,14 +21,17 @@ from mechsearch_jax.envs.page.facts import (
     hiding,
     moves,
     plain,
+    stalled,
     takes_target,
     tipped,
 )
 from mechsearch_jax.envs.page.pictures import target_pixels
-from mechsearch_jax.envs.page.story import Paragraph, at_wall, belief_in_words, came_into_view, stalled, story
+from mechsearch_jax.envs.page.story import Paragraph, at_wall, belief_in_words, came_into_view, story
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.workspace.detector import found_pixels
+
+_TRIAL = re.compile(r"\btrials?\b")
 
 
 class Ending(NamedTuple):
@@ -35,8 +40,9 @@ class Ending(NamedTuple):
     Attributes:
       good: whether the episode reached what its protocol asks for; None if nothing says so.
       title: in a few words.
-      sentences: what happened, the direct cause of a loss first.
+      sentences: what happened.
       blockers: the objects that the best grasps of the target hit; empty if none does or nothing is known.
+      cause: of a lost target the physical cause; empty if nothing shows one.
       story: of a lost target what was believed, what was done, and why it failed.
       remarks: what happened beside that.
       obstacles: the objects that block or hide a lost target at the last look, the most important first.
@@ -48,6 +54,7 @@ class Ending(NamedTuple):
     title: str
     sentences: list[str]
     blockers: tuple[int, ...]
+    cause: str = ""
     story: Sequence[Paragraph] = ()
     remarks: Sequence[str] = ()
     obstacles: tuple[int, ...] = ()
@@ -57,7 +64,8 @@ class Ending(NamedTuple):
     @property
     def words(self) -> str:
         """All that is said of the end."""
-        return " ".join([*self.sentences, *(paragraph.text for paragraph in self.story), *self.remarks])
+        cause = [self.cause] if self.cause else []
+        return " ".join([*cause, *self.sentences, *(paragraph.text for paragraph in self.story), *self.remarks])
 
 
 def ending(recording: Recording) -> Ending:
@@ -84,6 +92,7 @@ def _lost(recording: Recording, episode: Episode, tips: list[str]) -> Ending:
     still = not any(word in failure for word in ("fell", "error"))
     fatal = None if still and failure.startswith(("found", "not found")) else _fatal(episode, acts)
     obstacles = () if fatal is not None else _obstacles(recording, last)
+    why = cause(recording, fatal, obstacles)
     came = came_into_view(recording)
     if fatal is None:
         decisive = came if came is not None else stalled(recording)
@@ -91,17 +100,37 @@ def _lost(recording: Recording, episode: Episode, tips: list[str]) -> Ending:
         believing = came if last.found and came is not None else len(recording.steps) - 1
     else:
         decisive = believing = fatal
+    happened = [*why.evidence, _what_happened(recording, episode, acts, obstacles, bool(why.words))]
+    words, happened, paragraphs = _explained(why.words, happened, story(recording, fatal, obstacles, bool(why.words)))
     return Ending(
         False,
         f"Lost: {failure}",
-        [_what_happened(recording, episode, acts, obstacles)],
+        happened,
         blockers(last) if still else (),
-        story(recording, fatal, obstacles),
+        words,
+        paragraphs,
         _tipped(recording, fatal),
         obstacles,
         decisive,
         believing,
     )
+
+
+def _explained(
+    why: str, happened: Sequence[str], paragraphs: Sequence[Paragraph]
+) -> tuple[str, list[str], list[Paragraph]]:
+    """The texts of an end, in which it is said what a trial is where it is spoken of first."""
+    known = False
+
+    def explain(text: str) -> str:
+        nonlocal known
+        if known or not (word := _TRIAL.search(text)):
+            return text
+        known = True
+        return f"{text[: word.end()]} (simulated before acting){text[word.end() :]}"
+
+    first = explain(why), [explain(sentence) for sentence in happened]
+    return *first, [each._replace(sentences=[explain(sentence) for sentence in each.sentences]) for each in paragraphs]
 
 
 def _obstacles(recording: Recording, last: RecordedStep) -> tuple[int, ...]:
@@ -117,17 +146,19 @@ def _seen(episode: Episode) -> str:
     return f"The target was seen {first}"
 
 
-def _what_happened(recording: Recording, episode: Episode, acts: list[int], obstacles: tuple[int, ...]) -> str:
-    """The event that ended an episode without a retrieval, and its direct cause."""
+def _what_happened(
+    recording: Recording, episode: Episode, acts: list[int], obstacles: tuple[int, ...], explained: bool
+) -> str:
+    """The event that ended an episode without a retrieval, and its direct cause, unless that is explained."""
     failure, last = episode.failure or "", recording.steps[-1]
     every, were = ("The only action", "was") if len(acts) == 1 else (f"All {len(acts)} actions", "were")
     used = f"{every} that an episode may have {were} used up"
     if failure == "not found":
-        hidden = f": {objects_in_words(obstacles)} still hid it from the camera" if obstacles else ""
+        hidden = f": {objects_in_words(obstacles)} still hid it from the camera" if obstacles and not explained else ""
         return f"{used}, and the target was never found{hidden}.{_undetected(recording)}"
     if failure == "found, but not graspable":
         hits = None if last.evidence is None else last.evidence.hits
-        met = "" if hits is None or free(hits) else f": at the last look {grasps_in_words(hits)}"
+        met = "" if explained or hits is None or free(hits) else f": at the last look {grasps_in_words(hits)}"
         return f"{used} before any grasp of the target was free{met}."
     fatal = _fatal(episode, acts)
     if fatal is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,11 +13,12 @@ from jaxtyping import Bool, Float
 from mechsearch_jax.actions import KINDS, Action, kind_of
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.episode.records import ActionRecord
-from mechsearch_jax.envs.known_target.in_the_way import blocking
+from mechsearch_jax.envs.known_target.in_the_way import blocking, numbers_in_words
 from mechsearch_jax.envs.page.pictures import hidden_behind, last_world
 from mechsearch_jax.envs.pushing.pushes import toppled
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 
 # Failures of retrievals in the words of a page, and of other actions.
@@ -37,6 +39,9 @@ LEAST_SHARE = 0.05
 DISPLACED = 0.01
 # What lowers J by less promises nothing.
 LEAST_GAIN = 0.05
+
+# J that falls by no more than this share over the rest of an episode hardly falls; of fewer looks nothing is said.
+HARDLY, FEWEST_LOOKS = 0.05, 3
 
 
 def plain(failure: str) -> str:
@@ -63,6 +68,38 @@ def moves(action: Action) -> bool:
 def takes_target(step: RecordedStep) -> bool:
     """Whether a step's action is to take the target out."""
     return step.action is not None and kind_of(int(step.action.kind)).takes_target
+
+
+def moves_body(step: RecordedStep, k: int | str) -> bool:
+    """Whether the action of a step is to move a body, by its number."""
+    return step.action is not None and moves(step.action) and int(step.action.object) == k
+
+
+def actions_in_words(indices: Sequence[int]) -> str:
+    """Actions by their numbers."""
+    return f"{'action' if len(indices) == 1 else 'actions'} {numbers_in_words([i + 1 for i in indices])}"
+
+
+def candidates_of(step: RecordedStep) -> list[tuple[int, bool]]:
+    """Of every candidate of a step, refused ones included, the object that it was to move, and if it was refused."""
+    tried = nothing_tried() if step.evidence is None else step.evidence.tried
+    singles = [jax.tree.map(lambda a, k=k: a[k], tried.action) for k in range(len(tried.result))]
+    refused = [
+        action
+        for action, result in zip(singles, tried.result.tolist(), strict=True)
+        if result <= TrialResult.HARMFUL and moves(action)
+    ]
+    left = [step.sampled.single(k) for k in range(len(step.sampled))]
+    if takes_target(step):
+        # A retrieval leaves the sequences as they are, refused ones among them.
+        return [(int(action.object), any(same_motion(action, other) for other in refused)) for action in left]
+    return [(int(action.object), False) for action in left] + [(int(action.object), True) for action in refused]
+
+
+def since_found(recording: Recording) -> list[int]:
+    """The steps that count for what is in the way at the end: those at which the target was found, or else all."""
+    found = recording.steps[-1].found
+    return [i for i, step in enumerate(recording.steps) if step.found == found]
 
 
 def action_words(step: RecordedStep) -> str:
@@ -162,3 +199,37 @@ def blockers(step: RecordedStep) -> tuple[int, ...]:
 def target_is_out(recording: Recording) -> bool:
     """Whether the target is in front of the shelf at the end."""
     return bool(np.asarray(last_world(recording.steps[-1]).position)[TARGET, 0] < recording.shelf.front)
+
+
+def stalled(recording: Recording) -> int | None:
+    """The step from which on J fell no more, or hardly; None if it fell up to the end, or if no J is recorded."""
+    costs = costs_of(recording)
+    for i in range(len(costs) - FEWEST_LOOKS + 1):
+        if costs[i] - min(costs[i:]) <= max(LEAST_GAIN, HARDLY * costs[i]):
+            return i
+    return None
+
+
+def idle(recording: Recording, i: int) -> bool:
+    """Whether a step's action lowered J not, or hardly, or, where J after it was not observed, was not expected to.
+
+    False where that is not recorded, and of a policy that minds no J.
+    """
+    record = None if recording.episode is None else recording.episode.steps[i]
+    if record is None or record.action is None or record.cost is None or not record.compares_costs:
+        return False
+    since = stalled(recording)
+    if record.observed_cost is not None and since is not None and i >= since:
+        return True
+    after = record.predicted_cost if record.observed_cost is None else record.observed_cost
+    return after is not None and after >= record.cost - LEAST_GAIN
+
+
+def costs_of(recording: Recording) -> list[float]:
+    """J at every step before whose action it is recorded, from the first on; empty of a policy that minds none."""
+    costs = []
+    for record in () if recording.episode is None else recording.episode.steps:
+        if record.cost is None or record.action is None or not record.compares_costs:
+            break
+        costs.append(record.cost)
+    return costs

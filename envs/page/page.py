@@ -15,10 +15,12 @@ import jinja2
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs.episode.records import load_episode
 from mechsearch_jax.envs.page import steps as texts
+from mechsearch_jax.envs.page.causes import why_none
 from mechsearch_jax.envs.page.ending import Ending, ending
-from mechsearch_jax.envs.page.facts import action_words, executed_words, takes_target, target_is_out, tipped
+from mechsearch_jax.envs.page.facts import action_words, executed_words, idle, takes_target, target_is_out, tipped
 from mechsearch_jax.envs.page.pictures import Painter, changed_cells, data_uri, tried_grasp
-from mechsearch_jax.envs.page.story import idle
+from mechsearch_jax.envs.page.reasons import did_nothing
+from mechsearch_jax.envs.page.replays import trial_stop
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
@@ -94,7 +96,7 @@ def page(recording: Recording, film: str = "") -> str:
         card=_card(recording, painter, end),
         steps=shown,
         bands=[(band.colour, band.label) for band in drawing.bands()],
-        colours={name: getattr(drawing, name) for name in ("TARGET", "ACTION", "OBJECT")},
+        colours={"target": drawing.TARGET, "possible": drawing.BLOCKED[1], "free": drawing.GRASPABLE},
         left_out=left_out(recording),
     )
 
@@ -226,6 +228,8 @@ def step_words(recording: Recording, i: int, frame: Frame, obstacles: Sequence[i
     step, before = recording.steps[i], recording.steps[i - 1] if i else None
     record = None if recording.episode is None else recording.episode.steps[i]
     shapes = texts.shapes(recording, step, frame.owner)
+    tried = 0 if step.evidence is None else len(step.evidence.tried.result)
+    stops = [trial_stop(recording, i, k) for k in range(tried)]
     executed, over = executed_words(recording, i), texts.over(recording, step)
     return {
         "number": i + 1,
@@ -240,13 +244,14 @@ def step_words(recording: Recording, i: int, frame: Frame, obstacles: Sequence[i
         "truth": "" if over else texts.truth(step, record),
         "grasps": "" if over else texts.grasps_words(step),
         "candidates": texts.candidates(step, obstacles),
-        "unmoved": texts.unmoved(step, obstacles),
-        "trials": texts.trials(step),
+        "unmoved": texts.unmoved(step, obstacles, why_none(recording, i, obstacles[0]) if obstacles else ""),
+        "trials": texts.trials(step, stops),
         "shapes": shapes,
         "doubt": texts.doubt(recording, step, texts.depth_of(recording, step)) if shapes else None,
         "costs": texts.costs(recording, i),
         "troubles": texts.troubles(recording, i),
         "came_of_it": texts.came_of_it(recording, i),
+        "did_nothing": did_nothing(recording, i),
     }
 
 

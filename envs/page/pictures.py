@@ -250,7 +250,7 @@ def changed_cells(
 
 def colour_of(sure: float) -> str:
     """The colour of a recognised shape by how sure recognition is; blue where nothing says so."""
-    return drawing.TARGET if sure < DOUBTFUL else drawing.BLOCKED[1] if sure < SURE else drawing.ACTION
+    return drawing.TARGET if sure < DOUBTFUL else drawing.WARNING if sure < SURE else drawing.ACTION
 
 
 def tried_grasp(step: RecordedStep) -> Action | None:
@@ -269,7 +269,7 @@ def _draw_tried_grasp(axes: Axes, step: RecordedStep) -> None:
     grasp = tried_grasp(step)
     if grasp is not None:
         T = np.asarray(grasp.T_world_gripper, float)
-        sketches.draw_grasp(axes, sketches.from_above, T, float(grasp.opening), drawing.BLOCKED[1])
+        sketches.draw_grasp(axes, sketches.from_above, T, float(grasp.opening), drawing.INK)
 
 
 def is_known(target_pose: Float[np.ndarray, " 3"]) -> bool:

@@ -7,25 +7,35 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from mechsearch_jax.envs.known_target.in_the_way import numbers_in_words
+from mechsearch_jax.envs.page import causes
+from mechsearch_jax.envs.page.choices import begun, ways
 from mechsearch_jax.envs.page.facts import (
     DISPLACED,
     LEAST_GAIN,
+    actions_in_words,
+    believed_elsewhere,
+    blockers,
+    candidates_of,
+    counted,
+    idle,
     moves,
+    moves_body,
     number,
     same_action,
-    same_motion,
     shifts,
+    since_found,
     takes_target,
 )
+from mechsearch_jax.envs.page.places import groups, possible
+from mechsearch_jax.envs.page.replays import trial_stop
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 
-# How trials end that stand against an action.
+# How trials end that stand against an action; of one that failed, where simulating it once more does not say why.
 _ENDS = {
-    TrialResult.FAILED: "failed (held up, out of reach, or out of the hand)",
+    TrialResult.FAILED: "failed (why is not known)",
     TrialResult.HARMFUL: "did harm (something fell off the board, or the found target fell over)",
     TrialResult.UNKNOWN: "had no result",
 }
@@ -40,16 +50,15 @@ def reasons(recording: Recording, objects: Sequence[int]) -> list[str]:
       recording: of the episode.
       objects: in the way; of the first it is said, too, what moved it.
     """
-    last = recording.steps[-1]
-    since = [i for i, step in enumerate(recording.steps) if step.found == last.found]
-    total = sum(len(_candidates(recording.steps[i])) for i in since)
+    last, since = recording.steps[-1], since_found(recording)
+    total = sum(len(candidates_of(recording.steps[i])) for i in since)
     if not total:
         return []
     when = " since it was seen" if last.found else ""
     every = f"the {total} candidate actions{when}" if total > 1 else f"the only candidate action{when}"
     sentences, hopeless = [], last.found and _hopeless([recording.steps[i] for i in since])
     if hopeless:
-        refused = any(r for i in since for _, r in _candidates(recording.steps[i]))
+        refused = any(r for i in since for _, r in candidates_of(recording.steps[i]))
         left = " that trials left" if refused else ""
         sentences = [f"No candidate action{when}{left} was expected to lower J."]
         every = f"all {total}" if refused else f"these {total}"
@@ -78,17 +87,29 @@ def _considered(recording: Recording, since: Sequence[int], k: int, every: str, 
       every: all candidates of these steps, in words.
       promised: whether to say what they promised.
     """
-    rows = {i: _candidates(recording.steps[i]) for i in since}
+    rows = {i: candidates_of(recording.steps[i]) for i in since}
     to = "to push the target itself" if k == recording.steps[-1].scene.capacity else f"to move object {k}"
     of_it = {i: refused for i in since if (refused := [r for moved, r in rows[i] if moved == k])}
     if not of_it:
-        return f"None of {every} was {to}."
+        return f"None of {every} was {to}{_why_none(recording, k)}."
     count, refused = sum(map(len, of_it.values())), sum(map(sum, of_it.values()))
-    remarks = [f"{refused} refused after trials"] if refused else []
+    remarks = [f"{refused} refused after simulation"] if refused else []
     remarks += _when_none([i for i in since if rows[i]], list(of_it))
     remarked = f" ({', '.join(remarks)})" if remarks else ""
     promise = _promised(recording, since, k, "the others" if refused else "which") if promised else ""
     return f"{count} of {every} {'was' if count == 1 else 'were'} {to}{remarked}{promise}."
+
+
+def _why_none(recording: Recording, k: int) -> str:
+    """Why no candidate was to move an object, or that it is not known; of the target, which is not pushed, nothing."""
+    if k >= recording.steps[-1].scene.capacity or not (steps := causes.impossible(recording, k)):
+        return ""
+    i = steps[-1]
+    if why := causes.why_none(recording, i, k):
+        return f" (at step {i + 1} {why})"
+    could = begun(ways(recording, i, k) or ())
+    some = f"{counted(could, 'motion')} of it could be begun at step {i + 1}, and " if could else ""
+    return f" ({some}why none was a candidate is not known)"
 
 
 def _when_none(every: list[int], of_it: list[int]) -> list[str]:
@@ -131,7 +152,7 @@ def _promised(recording: Recording, since: Sequence[int], k: int, them: str) -> 
     words = f"; the best was expected to lower J by {number(-best[i])}"
     if not early:
         words = f", and none before action {promising[0] + 1} was expected to lower J; the best, by {number(-best[i])}"
-    if _moves_object(step, k) and chosen and chosen[0] <= best[i]:
+    if moves_body(step, k) and chosen and chosen[0] <= best[i]:
         return f"{words} (action {i + 1})" if early else f"{words}, was action {i + 1}"
     there = f", where {number(max(-chosen[0], 0.0))} was expected of the chosen action" if chosen else ""
     return f"{words} (at step {i + 1}{there})" if early else f"{words}, came at step {i + 1}{there}"
@@ -158,25 +179,26 @@ def _unseen(recording: Recording, i: int, k: int) -> str:
 
 def _trials(recording: Recording, since: Sequence[int], k: int) -> str:
     """How the trials ended that stood against moving an object; empty if none did."""
-    results = []
+    ends = []
     for i in since:
         evidence = recording.steps[i].evidence
         tried = nothing_tried() if evidence is None else evidence.tried
         for row, result in enumerate(tried.result.tolist()):
             action = jax.tree.map(lambda a, row=row: a[row], tried.action)
             if moves(action) and int(action.object) == k:
-                results.append(TrialResult(result))
-    ends = [(results.count(result), end) for result, end in _ENDS.items() if result in results]
-    if not ends:
+                stop = trial_stop(recording, i, row)
+                ends.append(_ENDS.get(TrialResult(result), "") if stop is None else f"failed ({stop.words})")
+    counts = [(ends.count(end), end) for end in dict.fromkeys(ends) if end]
+    if not counts:
         return ""
-    if len(results) == 1:
-        return f"The only trial of moving object {k} {ends[0][1]}."
-    if ends[0][0] == len(results):
-        return f"All {len(results)} trials of moving object {k} {ends[0][1]}."
-    counts = " and ".join(f"{count} {end}" for count, end in ends)
-    if len(ends) > 1:
-        return f"Of {len(results)} trials of moving object {k}, {counts}."
-    return f"{ends[0][0]} of the {len(results)} trials of moving object {k} {ends[0][1]}."
+    if len(ends) == 1:
+        return f"The only trial of moving object {k} {counts[0][1]}."
+    if counts[0][0] == len(ends):
+        return f"All {len(ends)} trials of moving object {k} {counts[0][1]}."
+    if len(counts) > 1:
+        listed = " and ".join(f"{count} {end}" for count, end in counts)
+        return f"Of {len(ends)} trials of moving object {k}, {listed}."
+    return f"{counts[0][0]} of the {len(ends)} trials of moving object {k} {counts[0][1]}."
 
 
 def _carried_out(recording: Recording, since: Sequence[int], k: int) -> str:
@@ -185,46 +207,21 @@ def _carried_out(recording: Recording, since: Sequence[int], k: int) -> str:
     if not acts:
         return ""
     moved = {i: float(shifts(recording, i)[k]) for i in acts}
-    own = [i for i in acts if _moves_object(recording.steps[i], k)]
+    own = [i for i in acts if moves_body(recording.steps[i], k)]
     along = [i for i in acts if i not in own and moved[i] > DISPLACED]
     aside = ""
     if along:
         length = f"{100 * min(moved[i] for i in along):.1f}", f"{100 * max(moved[i] for i in along):.1f}"
         by = " to ".join(dict.fromkeys(length))
-        aside = f"; {_actions(along)} moved it along, by {by} cm"
+        aside = f"; {actions_in_words(along)} moved it along, by {by} cm"
     if not own:
         none = f"None of the {len(acts)} actions was" if len(acts) > 1 else "The only action was not"
         return f"{none} to move object {k}{aside or ', and it stayed where it was'}."
-    were = f"{_actions(own).capitalize()} {'was' if len(own) == 1 else 'were'} to move object {k}"
+    were = f"{actions_in_words(own).capitalize()} {'was' if len(own) == 1 else 'were'} to move object {k}"
     far = sum(moved[i] for i in own)
     if max(moved[i] for i in own) <= DISPLACED:
         return f"{were}, and it stayed where it was{aside}."
     return f"{were}, by {100 * far:.0f} cm{' in all' if len(own) > 1 else ''}, and left it in the way{aside}."
-
-
-def _actions(indices: Sequence[int]) -> str:
-    """Actions by their numbers."""
-    return f"{'action' if len(indices) == 1 else 'actions'} {numbers_in_words([i + 1 for i in indices])}"
-
-
-def _moves_object(step: RecordedStep, k: int) -> bool:
-    return step.action is not None and moves(step.action) and int(step.action.object) == k
-
-
-def _candidates(step: RecordedStep) -> list[tuple[int, bool]]:
-    """Of every candidate of a step, refused ones included, the object that it was to move, and if it was refused."""
-    tried = nothing_tried() if step.evidence is None else step.evidence.tried
-    singles = [jax.tree.map(lambda a, k=k: a[k], tried.action) for k in range(len(tried.result))]
-    refused = [
-        action
-        for action, result in zip(singles, tried.result.tolist(), strict=True)
-        if result <= TrialResult.HARMFUL and moves(action)
-    ]
-    left = [step.sampled.single(k) for k in range(len(step.sampled))]
-    if takes_target(step):
-        # A retrieval leaves the sequences as they are, refused ones among them.
-        return [(int(action.object), any(same_motion(action, other) for other in refused)) for action in left]
-    return [(int(action.object), False) for action in left] + [(int(action.object), True) for action in refused]
 
 
 def moved_in_words(recording: Recording, i: int, target: bool = True) -> str:
@@ -239,3 +236,49 @@ def moved_in_words(recording: Recording, i: int, target: bool = True) -> str:
     moved = [k for k in np.argsort(-far, kind="stable").tolist() if far[k] > DISPLACED and (target or k != TARGET)]
     named = [f"{'the target' if k == TARGET else f'object {k}'} by {100 * far[k]:.0f} cm" for k in moved]
     return " and ".join([", ".join(named[:-1]), named[-1]] if len(named) > 1 else named)
+
+
+def did_nothing(recording: Recording, i: int) -> str:
+    """Why a step's action did nothing for the search, and why it was chosen all the same; empty if it did something."""
+    step = recording.steps[i]
+    if not idle(recording, i) or step.action is None or takes_target(step):
+        return ""
+    record = None if recording.episode is None else recording.episode.steps[i]
+    fell = record is not None and record.observed_cost is not None and record.observed_cost < (record.cost or 0.0)
+    why = _in_vain(recording, i)
+    chosen = [k for k in range(len(step.sampled)) if same_action(step, step.sampled.action, k)][:1]
+    promised = [float(step.sampled.value[k]) for k in chosen]
+    all_the_same = ""
+    if len(step.sampled) and float(step.sampled.value.min()) >= -LEAST_GAIN:
+        all_the_same = " It was made all the same, as no candidate was expected to lower J."
+    elif promised and promised[0] < -LEAST_GAIN:
+        all_the_same = f" J was expected to fall by {number(-promised[0])}."
+    return (
+        f"It did {'next to ' if fell else ''}nothing for the search{f', because {why}' if why else ''}.{all_the_same}"
+    )
+
+
+def _in_vain(recording: Recording, i: int) -> str:
+    """Why J did not fall by an action, without an end; empty if that is not known."""
+    step, action = recording.steps[i], recording.steps[i].action
+    k = -1 if action is None else int(action.object)
+    if not 0 <= k < step.scene.capacity:
+        return ""
+    if step.found and step.evidence is not None and not len(step.evidence.hits):
+        return "the arm can reach no grasp of the target, whatever stands around it"
+    if shifts(recording, i)[k] <= DISPLACED:
+        return f"object {k} stayed where it was"
+    after = recording.steps[i + 1] if i + 1 < len(recording.steps) else None
+    if step.found:
+        before, now = blockers(step), () if after is None else blockers(after)
+        if before and k not in before:
+            return f"object {k} is not in the way of the target’s best grasps"
+        return f"object {k} is still in the way of the target’s best grasps" if k in now else ""
+    if believed_elsewhere(step):
+        return ""
+    behind = {group.hider: group.count for group in groups(recording, step)}
+    if k not in behind:
+        return f"none of the places where the target can be is behind object {k}"
+    if after is None or after.found or possible(recording, after).sum() < possible(recording, step).sum():
+        return ""
+    return "the target can be at as many places after it as before"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,6 +28,7 @@ from mechsearch_jax.envs.page.facts import (
 )
 from mechsearch_jax.envs.page.pictures import objects_of
 from mechsearch_jax.envs.page.reasons import moved_in_words
+from mechsearch_jax.envs.page.replays import Stop, run_stop
 from mechsearch_jax.envs.page.story import WRONG
 from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
@@ -39,7 +39,7 @@ from mechsearch_jax.planner.trials import TrialResult
 
 RESULTS = {
     TrialResult.SUCCEEDED: ("good", "went as intended"),
-    TrialResult.FAILED: ("poor", "not carried out as intended: held up, out of reach, or out of the hand"),
+    TrialResult.FAILED: ("poor", "failed; why is not known"),
     TrialResult.HARMFUL: ("bad", "harm: something fell off the board, or the found target fell over"),
     TrialResult.UNSURE: ("poor", "the target was taken out here, but not in every scene nearby"),
     TrialResult.UNKNOWN: ("poor", "no result: it could not be simulated"),
@@ -163,11 +163,18 @@ def candidates(step: RecordedStep, obstacles: Sequence[int] = ()) -> list[Candid
     return shown
 
 
-def unmoved(step: RecordedStep, obstacles: Sequence[int]) -> str:
-    """That no candidate was to move the object that is in the way at the end; empty if one was."""
+def unmoved(step: RecordedStep, obstacles: Sequence[int], why: str = "") -> str:
+    """That no candidate was to move the object that is in the way at the end; empty if one was.
+
+    Args:
+      step: with the decision.
+      obstacles: the objects in the way at the end.
+      why: in words; empty if that is not known.
+    """
     if not obstacles or not len(step.sampled) or (step.sampled.action.object == obstacles[0]).any():
         return ""
-    return f"No candidate of this step was to move object {obstacles[0]}, which is in the way at the end."
+    none = f"No candidate of this step was to move object {obstacles[0]}, which is in the way at the end"
+    return f"{none}: {why}." if why else f"{none}; why is not known."
 
 
 def _alike(one: Candidate, other: Candidate) -> bool:
@@ -210,8 +217,13 @@ def _were(count: int) -> str:
     return "was" if count == 1 else "were"
 
 
-def trials(step: RecordedStep) -> list[Trial]:
-    """What was tried out at a step, in order."""
+def trials(step: RecordedStep, stops: Sequence[Stop | None] = ()) -> list[Trial]:
+    """What was tried out at a step, in order; trials that read the same stand where the first of them does.
+
+    Args:
+      step: of the trials.
+      stops: why each of them failed, as far as that is known; may be left out.
+    """
     if step.evidence is None:
         return []
     tried = step.evidence.tried
@@ -228,10 +240,10 @@ def trials(step: RecordedStep) -> list[Trial]:
             failed = "the target was not taken out, here or in a scene nearby"
             words = {TrialResult.UNSURE: words, TrialResult.UNKNOWN: "no result"}.get(result, failed)
             colour, verdict = "poor", "chosen" if made else "passed over"
-        rows.append(Trial(kind.describe(single, step.scene.capacity), words, colour, verdict))
-    # Grasps of the target are alike in words.
-    alike = [(row, len(list(group))) for row, group in itertools.groupby(rows)]
-    return [row._replace(words=f"{row.words}, {count} ways") if count > 1 else row for row, count in alike]
+        stop = stops[k] if stops else None
+        rows.append(Trial(kind.describe(single, step.scene.capacity), stop.words if stop else words, colour, verdict))
+    counts = [(row, rows.count(row)) for row in dict.fromkeys(rows)]
+    return [row._replace(words=f"{row.words}, {count} ways") if count > 1 else row for row, count in counts]
 
 
 def truth(step: RecordedStep, record: Step | None) -> str:
@@ -258,7 +270,9 @@ def troubles(recording: Recording, i: int) -> list[str]:
         return []
     record, after = recording.episode.steps[i], [] if recording.episode.retrieved else recording.steps[i + 1 : i + 2]
     fell = [why for step in after if (why := trouble(recording, step)) and not record.target_fallen]
-    return [*([plain(record.failure)] if record.failure else []), *events(record), *fell]
+    stop = run_stop(recording, i)
+    failed = [plain(record.failure)] if record.failure else []
+    return [*(failed if stop is None else [stop.words]), *events(record), *fell]
 
 
 def came_of_it(recording: Recording, i: int) -> str:

@@ -10,7 +10,9 @@ from jaxtyping import Bool
 
 from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words, objects_in_words
 from mechsearch_jax.envs.page import facts
+from mechsearch_jax.envs.page.places import groups, groups_in_words, possible
 from mechsearch_jax.envs.page.reasons import moved_in_words, reasons
+from mechsearch_jax.envs.page.replays import trial_stop
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner.trials import TrialResult
@@ -18,17 +20,23 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 # A target that is believed to be farther than this from where it is counts as wrongly seen [m].
 WRONG = 0.02
-# J that falls by no more than this share over the rest of an episode hardly falls; of fewer looks nothing is said.
-HARDLY, FEWEST_LOOKS = 0.05, 3
+# The label of what only adds numbers.
+NUMBERS = "Why not, in numbers"
 # Objects in the way of which it is said why they stayed there, at most.
 MOST_NAMED = 2
 
 
 class Paragraph(NamedTuple):
-    """What stands under a label."""
+    """What stands under a label.
+
+    Attributes:
+      label, sentences: as they are shown.
+      details: whether it only adds numbers to what is said before.
+    """
 
     label: str
     sentences: list[str]
+    details: bool = False
 
     @property
     def text(self) -> str:
@@ -36,19 +44,22 @@ class Paragraph(NamedTuple):
         return " ".join(self.sentences)
 
 
-def story(recording: Recording, fatal: int | None, obstacles: Sequence[int]) -> list[Paragraph]:
+def story(
+    recording: Recording, fatal: int | None, obstacles: Sequence[int], explained: bool = False
+) -> list[Paragraph]:
     """What was believed, what was done and why it failed, of a lost target; paragraphs that say nothing are left out.
 
     Args:
       recording: of the episode, with its record.
       fatal: the step whose action did what cannot be mended; None if the target could still have been taken out.
       obstacles: the objects that block or hide it at the last look.
+      explained: whether the physical cause is said before.
     """
     failed = _failed(recording, obstacles) if fatal is None else warned(recording, fatal)
     paragraphs = (
         Paragraph("Believed", _believed(recording, fatal)),
         Paragraph("Done", _done(recording, fatal, obstacles)),
-        Paragraph("Failed because", failed),
+        Paragraph("Failed because", failed) if fatal is not None or not explained else Paragraph(NUMBERS, failed, True),
     )
     return [paragraph for paragraph in paragraphs if paragraph.sentences]
 
@@ -59,44 +70,9 @@ def came_into_view(recording: Recording) -> int | None:
     return found[0] - 1 if found and found[0] else None
 
 
-def stalled(recording: Recording) -> int | None:
-    """The step from which on J fell no more, or hardly; None if it fell up to the end, or if no J is recorded."""
-    costs = _costs(recording)
-    for i in range(len(costs) - FEWEST_LOOKS + 1):
-        if costs[i] - min(costs[i:]) <= max(facts.LEAST_GAIN, HARDLY * costs[i]):
-            return i
-    return None
-
-
-def idle(recording: Recording, i: int) -> bool:
-    """Whether a step's action lowered J not, or hardly, or, where J after it was not observed, was not expected to.
-
-    False where that is not recorded, and of a policy that minds no J.
-    """
-    record = None if recording.episode is None else recording.episode.steps[i]
-    if record is None or record.action is None or record.cost is None or not record.compares_costs:
-        return False
-    since = stalled(recording)
-    if record.observed_cost is not None and since is not None and i >= since:
-        return True
-    after = record.predicted_cost if record.observed_cost is None else record.observed_cost
-    return after is not None and after >= record.cost - facts.LEAST_GAIN
-
-
-def _costs(recording: Recording) -> list[float]:
-    """J at every step before whose action it is recorded, from the first on; empty of a policy that minds none."""
-    costs = []
-    for record in () if recording.episode is None else recording.episode.steps:
-        if record.cost is None or record.action is None or not record.compares_costs:
-            break
-        costs.append(record.cost)
-    return costs
-
-
 def belief_in_words(recording: Recording, step: RecordedStep) -> list[str]:
     """Where a target that is not found was believed to be, whether rightly, and what hides it."""
-    size, poses = int(step.existence.sum()), len(step.existence)
-    sentences = [f"The robot believed that it can be at {size} of {poses} poses{_rightly(recording, step)}."]
+    sentences = [f"The robot believed that it can be {_places(recording, step)}."]
     if facts.believed_elsewhere(step):
         sentences = ["The robot took something else for the target, and looked for it no more."]
     if hiding := facts.hiding(recording, step):
@@ -108,11 +84,28 @@ def _shares(hiding: Sequence[tuple[int, float]]) -> str:
     return " and ".join(f"object {i} ({100 * share:.0f} % of it)" for i, share in hiding)
 
 
+def _places(recording: Recording, step: RecordedStep, first: RecordedStep | None = None) -> str:
+    """Where a target could be in words, and whether rightly.
+
+    Args:
+      recording: of the episode.
+      step: of the belief.
+      first: an earlier step, whose number of places is named if it is another.
+    """
+    can = possible(recording, step)
+    size, count = int(can.sum()), len(can)
+    at_first = int(possible(recording, first).sum()) if first is not None else size
+    before = f" ({at_first} at first)" if at_first != size else ""
+    listed = groups_in_words(groups(recording, step))
+    of = f"{size} of {count} places{before}"
+    return f"{listed}: {of}{_rightly(recording, step)}" if listed else f"at {of}{_rightly(recording, step)}"
+
+
 def _rightly(recording: Recording, step: RecordedStep) -> str:
-    """Whether the true pose is one of those that were thought possible; empty if that is not recorded."""
+    """Whether the true place is one of those that were thought possible; empty if that is not recorded."""
     record = None if recording.episode is None else recording.episode.steps[recording.steps.index(step)]
     right = None if record is None else record.truth_possible
-    return {True: ", its true pose among them", False: ", its true pose not among them", None: ""}[right]
+    return {True: ", the true one among them", False: ", the true one not among them", None: ""}[right]
 
 
 def _believed(recording: Recording, fatal: int | None) -> list[str]:
@@ -120,25 +113,20 @@ def _believed(recording: Recording, fatal: int | None) -> list[str]:
     steps, came = recording.steps, came_into_view(recording)
     last = steps[-1] if fatal is None else steps[fatal]
     if not last.found:
-        first, now = (int(step.existence.sum()) for step in (steps[0], last))
         when = "At the last look" if fatal is None else f"Before action {fatal + 1}"
         if facts.believed_elsewhere(last):
             return [f"{when} the robot took something else for the target, and looked for it no more."]
-        less = f" ({first} at first)" if first != now else ""
         can = "can" if fatal is None else "could"
-        where = f"the robot believed that it {can} be at {now} of {len(last.existence)} poses{less}"
+        sentences = [f"{when} the robot believed that the target {can} be {_places(recording, last, steps[0])}."]
         hidden = facts.hiding(recording, last) if fatal is not None else []
-        behind = f" the target was hidden by {_shares(hidden)};" if hidden else ""
-        return [f"{when}{behind} {where}{_rightly(recording, last)}."]
+        return [*sentences, f"It was hidden by {_shares(hidden)}."] if hidden else sentences
     known = _known(last)
     if came is None:
         return [f"The target was seen at the first look{f'; from then on {known}' if known else ''}."]
-    before = steps[came]
-    hidden = facts.hiding(recording, before)
-    behind = f", hidden by {_shares(hidden)}" if hidden else ""
-    size, poses = int(before.existence.sum()), len(before.existence)
-    where = f"the robot believed that it could be at {size} of {poses} poses{_rightly(recording, before)}"
-    sentences = [f"Up to action {came + 1} the target was not seen{behind}: {where}."]
+    where = f"the robot believed that it could be {_places(recording, steps[came])}"
+    hidden = facts.hiding(recording, steps[came])
+    behind = f"hidden by {_shares(hidden)}" if hidden else "not seen"
+    sentences = [f"Up to action {came + 1} the target was {behind}; {where}."]
     return [*sentences, f"From then on {known}."] if known else sentences
 
 
@@ -199,7 +187,7 @@ def _displaced(recording: Recording, came: int | None) -> list[str]:
 
 def _course(recording: Recording) -> list[str]:
     """How J went, and since when it fell no more; empty if that is not recorded."""
-    costs, since, number = _costs(recording), stalled(recording), facts.number
+    costs, since, number = facts.costs_of(recording), facts.stalled(recording), facts.number
     if len(costs) < 2:
         return _mindless(recording)
     if since is None:
@@ -235,7 +223,7 @@ def _fatal_action(recording: Recording, i: int) -> list[str]:
     if moved := moved_in_words(recording, i, target=not facts.takes_target(recording.steps[i])):
         tips = facts.tipped(recording, i)
         over = f", and tipped {objects_in_words(tips)}" if tips else ""
-        sentences.append(f"In the run it moved {moved}{over}.")
+        sentences.append(f"In the run {'it' if sentences else f'action {i + 1}'} moved {moved}{over}.")
     return sentences
 
 
@@ -262,7 +250,11 @@ def warned(recording: Recording, i: int) -> list[str]:
         went = "In its trial that had not happened: it went as intended" if other else "Its trial had gone as intended"
         return [f"{went}, and nothing fell off the board.", *hidden]
     if result is TrialResult.FAILED:
-        return ["In its trial it was not carried out as intended, but nothing fell.", *hidden]
+        tried = step.evidence.tried.action
+        row = next(k for k in range(len(tried.kind)) if facts.same_action(step, tried, k))
+        stop = trial_stop(recording, i, row)
+        why = "it was not carried out as intended, but nothing fell" if stop is None else stop.words
+        return [f"In its trial {why}.", *hidden]
     return []
 
 

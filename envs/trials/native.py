@@ -182,9 +182,9 @@ class NativeTrials:
     ) -> tuple[World, TrialScene | None]:
         """The world of a row, and the scene in which it is at rest; None if it cannot be built."""
         objects = jax.tree.map(lambda a: a[row], scenes.objects)
-        world = jax.device_get(_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
+        world = jax.device_get(trial_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
         friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
-        return world, _at_rest(cell, simulation, world, objects, friction, mass)
+        return world, scene_at_rest(cell, simulation, world, objects, friction, mass)
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
@@ -193,7 +193,10 @@ class NativeTrials:
     def cell_programs(self, cell: Cell) -> list[Program]:
         """`programs` without a problem."""
         nowhere = jax.device_get((empty(TARGET), jnp.zeros(3), jnp.array(False)))
-        return [*motions(self._motion_config(cell)), program("small ones", _world, cell.target, cell.shelf, *nowhere)]
+        return [
+            *motions(self._motion_config(cell)),
+            program("small ones", trial_world, *cell[:2], *nowhere),
+        ]
 
     def _motion_config(self, cell: Cell) -> MotionConfig:
         return dataclasses.replace(self.simulation.motion, gripper=cell.gripper)
@@ -212,7 +215,7 @@ def _attempted(
 
 
 @kept(on_host=True)
-def _world(
+def trial_world(
     target: Target, shelf: Shelf, objects: Superquadrics, pose: Float[Array, "3"], found: Bool[Array, ""]
 ) -> World:
     """The bodies of the objects, and of the target if it is found."""
@@ -227,7 +230,7 @@ def _world(
     )
 
 
-def _at_rest(
+def scene_at_rest(
     cell: Cell,
     simulation: SimulatorConfig,
     world: World,

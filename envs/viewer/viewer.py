@@ -214,7 +214,7 @@ class Viewer:
         with gui.add_folder("what was compared, trials, and what was recognised"):
             self._evidence = gui.add_html("")
             self._perceived = gui.add_image(
-                _NO_PICTURE, label="recognised shapes; orange: less than 80 % sure, red: less than 50 %",
+                _NO_PICTURE, label="recognised shapes; yellow: less than 80 % sure, red: less than 50 %",
                 jpeg_quality=QUALITY, visible=False,
             )  # fmt: skip
         with gui.add_folder("layers"):

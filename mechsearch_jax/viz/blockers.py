@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing
@@ -18,7 +19,7 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-MARK = drawing.BLOCKED[2]
+MARK = drawing.WARNING
 _WIDTH, _GAP, _TITLE, _LINE = 4.6, 0.16, 0.34, 0.2
 # Letters in a line of text, for each inch of the figure's width.
 _LETTERS = 13
@@ -48,7 +49,7 @@ class Moment:
 def blockers_figure(
     moments: Sequence[Moment], camera: Camera, shelf: Shelf, target: Target, heading: str, text: str
 ) -> Figure:
-    """Draw moments side by side, each in the camera's view and from above, with objects in the way in orange.
+    """Draw moments side by side, each in the camera's view and from above, with objects in the way in yellow.
 
     Args:
       moments: at least one.
@@ -113,4 +114,6 @@ def _mark(axes: Axes, outlines: Sequence[Float[np.ndarray, "corners 2"] | None])
     for outline in outlines:
         if outline is not None:
             style = {"facecolor": (*drawing.rgb(MARK), 0.3), "edgecolor": MARK, "lw": 2.2, "zorder": 4}
-            axes.add_patch(patches.Polygon(outline, closed=True, **style))
+            patch = axes.add_patch(patches.Polygon(outline, closed=True, **style))
+            # Yellow alone is hard to see on the bright board.
+            patch.set_path_effects([Stroke(linewidth=4.0, foreground=drawing.INK), Normal()])

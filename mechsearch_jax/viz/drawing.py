@@ -35,8 +35,11 @@ OBJECT = "#5b6b7a"
 ACTION = "#1b5fc1"
 TARGET = "#d1344b"
 GRASPABLE = "#2a9d78"
-BLOCKED = ("#f2c14e", "#ee9b3a", "#d9622b", "#9c3d2e")
-NO_GRASP = "#8d7b9c"
+# The more objects are in the way, the darker. Also who sees no red or no green tells them apart, and from `TARGET`.
+BLOCKED = ("#d3b5e5", "#ad7fd0", "#7f4fa8", "#4c2a6b")
+NO_GRASP = "#c4bfb4"
+# What is in the way, and what is doubtful.
+WARNING = "#f2b100"
 HAND = INK
 
 # Margins of pictures from above: in front of the shelf, and beside and behind it [m].
