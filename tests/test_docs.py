@@ -339,7 +339,7 @@ def test_the_rates_of_the_readme_are_the_stored_ones():
 
 
 def test_what_comes_of_images_stands_beside_the_papers_figures():
-    run, any_grasp = (load_run(RESULTS / "runs", name) for name in ("collision-free-h200", "table1-nearby-h200"))
+    run, any_grasp = (load_run(RESULTS / "runs", name) for name in ("collision-free-h200", "table1-with-friction-h200"))
     seeds = len(run.lines[0]["seeds"])
     header = (
         f"| objects | `masks`, {90 * seeds} episodes: found | graspable | retrieved | the paper: found | graspable |"

@@ -29,7 +29,7 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default. Fields of the page are named after them.
-RUNS = ("table1-nearby-h200", "report-g-h200", "collision-free-h200", "report-e-h200")
+RUNS = ("table1-with-friction-h200", "report-g-h200", "collision-free-h200", "report-e-h200")
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
