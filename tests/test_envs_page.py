@@ -289,7 +289,7 @@ def test_endings_name_what_happened():
     toppled = of("the target fell over", (record(PUSH, target_fallen=True), EPISODE.steps[1]))
     assert toppled.sentences[0].startswith("The target fell over at action 1, “push object 0")
     unseen = of("not found", recorded=(STEPS[0], dataclasses.replace(STEPS[1], found=False, evidence=evidence())))
-    assert unseen.sentences[-1].endswith("and the target was never found.")
+    assert unseen.sentences[-1].endswith("and the camera never saw the target.")
     assert unseen.cause.endswith("hidden from the camera by object 0.")
     assert f"of {POSES} places, the true one among them." in unseen.words
     # The best was also chosen.

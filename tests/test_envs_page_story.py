@@ -116,7 +116,7 @@ def test_the_action_that_brought_the_target_into_view_and_left_its_blocker_is_na
         (
             (90.0, 50.0, 49.0, 48.5),
             1,
-            "J fell from 90 to 50 by step 2; from action 2 on it hardly fell: at best to 48.5.",
+            "J fell from 90 to 50.0 by step 2; from action 2 on it hardly fell: at best to 48.5.",
         ),
         ((90.0, 50.0, 30.0), None, "J fell from 90 to 30 (step 3)."),
     ],

@@ -155,7 +155,10 @@ def _what_happened(
     used = f"{every} that an episode may have {were} used up"
     if failure == "not found":
         hidden = f": {objects_in_words(obstacles)} still hid it from the camera" if obstacles and not explained else ""
-        return f"{used}, and the target was never found{hidden}.{_undetected(recording)}"
+        seen = _undetected(recording)
+        return (
+            f"{used}, and {'the target was never found' if seen else 'the camera never saw the target'}{hidden}.{seen}"
+        )
     if failure == "found, but not graspable":
         hits = None if last.evidence is None else last.evidence.hits
         met = "" if explained or hits is None or free(hits) else f": at the last look {grasps_in_words(hits)}"

@@ -119,7 +119,9 @@ def stamp() -> str:
 
 
 def _card(recording: Recording, painter: Painter, end: Ending) -> dict[str, Any]:
-    last = painter.end(end.blockers)
+    # Where no grasp is blocked, what hides the target is marked.
+    hides = end.obstacles[:1] if not end.blockers and not recording.steps[-1].found else ()
+    last = painter.end(end.blockers or hides)
     return {
         **end._asdict(),
         "decisive": end.decisive or 0,
@@ -133,6 +135,7 @@ def _card(recording: Recording, painter: Painter, end: Ending) -> dict[str, Any]
         "seen": data_uri(last.seen),
         "above": data_uri(last.above),
         "blockers": last.blockers,
+        "hides": bool(hides),
         "belief": _belief(recording, painter, end),
     }
 

@@ -194,10 +194,13 @@ def _course(recording: Recording) -> list[str]:
         fell = f"J fell from {number(costs[0])} to {number(costs[-1])} (step {len(costs)})"
         return [f"{fell}."] if costs[-1] < costs[0] - facts.LEAST_GAIN else []
     rest, fell = costs[since:], ""
+    hardly = rest[0] - min(rest) > facts.LEAST_GAIN
     if since and costs[since] < costs[0] - facts.LEAST_GAIN:
-        fell = f"J fell from {number(costs[0])} to {number(costs[since])} by step {since + 1}; "
+        # To a digit more where what it hardly fell to is compared with it.
+        least = f"{costs[since]:.1f}" if hardly else number(costs[since])
+        fell = f"J fell from {number(costs[0])} to {least} by step {since + 1}; "
     j, on = "it" if fell else "J", f"{'f' if fell else 'F'}rom action {since + 1} on"
-    if rest[0] - min(rest) > facts.LEAST_GAIN:
+    if hardly:
         return [f"{fell}{on} {j} hardly fell: at best to {min(rest):.1f}."]
     level = max(rest) - rest[0] <= facts.LEAST_GAIN
     there = f"at each of steps {since + 1} to {len(costs)}" if level else f"at step {len(costs)}"
