@@ -118,8 +118,12 @@ class Rollout:
 
     def update(self, state: State, moved: Bool[Array, " n"]) -> State:
         """Bring f and g of a state up to date after some objects moved."""
-        problem, settings = self.problem, self.problem.config.existence
+        problem, settings, grasps = self.problem, self.problem.config.existence, self.belief.grasps
         objects = state.scene.replace(valid=state.scene.valid & ~state.is_target)
+        if self.belief.exists.shape[-1] == 0:
+            # Only the found pose counts; see `belief.without_candidates`.
+            counts = self.objective.needs_graspability(self.belief, state)[-1]
+            return state.replace(hits=found_hits(problem.target_grasps, grasps, objects, counts, state.hits, moved))
         counts_collisions = state.exists if self.config.predicted_collisions else None
         views = object_views(
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
@@ -129,7 +133,7 @@ class Rollout:
         at_candidate_poses, at_found_pose = split_found(
             self.objective.needs_graspability(self.belief, state.replace(exists=exists))
         )
-        grasps, rows = self.belief.grasps, problem.grasps.pair_pose.shape[0]
+        rows = problem.grasps.pair_pose.shape[0]
         # After the target moved, other rows of H count, which are not computed yet.
         stale = moved | jnp.any(moved & state.is_target)
         hits = grasp_hits(problem.grasps, objects, at_candidate_poses, state.hits[:rows], stale)
