@@ -119,19 +119,27 @@ def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspC
     return TargetGrasps(grasp_tables(gripper, target, config), shelf, gripper, target, config)
 
 
+def can_be_joined(sets: Sequence[TargetGrasps]) -> bool:
+    """Whether several sets of grasps for the same target can be `joined`: they may differ in which grasps there are,
+    but not in how grasps are tested."""
+
+    def tested(one: TargetGrasps) -> tuple[Any, ...]:
+        tables, config = one.tables, one.config
+        shapes = tables.clouds.shape[1:], tables.still_gripper.shape[1:], tables.still_target.shape
+        return config.waypoints, config.max_yaw, shapes
+
+    return len({tested(one) for one in sets}) == 1
+
+
 def joined(sets: Sequence[TargetGrasps]) -> TargetGrasps:
     """All grasps of several sets for the same target, in order, as one set.
 
-    Args:
-      sets: their configurations may differ in which grasps there are, but neither in how many points clouds have nor
-        in `waypoints` and `max_yaw`.
-
     Raises:
-      ValueError: they do.
+      ValueError: they cannot be joined.
     """
+    if not can_be_joined(sets):
+        raise ValueError("joined: the sets differ in waypoints, max_yaw or the numbers of points")
     first, tables = sets[0], [one.tables for one in sets]
-    if any((s.config.waypoints, s.config.max_yaw) != (first.config.waypoints, first.config.max_yaw) for s in sets):
-        raise ValueError("joined: the sets differ in waypoints or max_yaw")
     # Each set has its own wrists.
     before = np.cumsum([0, *(len(table.still_gripper) for table in tables)])
     fields: dict[str, Any] = {

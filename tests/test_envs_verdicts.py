@@ -17,7 +17,7 @@ from mechsearch_jax.envs.episode.verdicts import Verdict, free_in_sets, judge, p
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.retrieval import best_grasp, joined, target_grasps
+from mechsearch_jax.retrieval import best_grasp, can_be_joined, joined, target_grasps
 from mechsearch_jax.workspace.target import Target
 
 
@@ -61,17 +61,22 @@ def test_the_papers_grasps_do_not_depend_on_the_methods(problem):
         assert judge(other, here).paper_graspable == expected
 
 
-def test_sets_of_grasps_are_judged_together_as_each_alone(problem):
-    sets = verdicts.judged_sets(problem)
+@pytest.mark.parametrize("changes", [{}, {"waypoints": 3}, {"points": 1024}], ids=["alike", "waypoints", "points"])
+def test_sets_of_grasps_are_judged_together_as_each_alone(problem, changes):
+    own, papers = verdicts.judged_sets(problem)
+    if changes:
+        config = dataclasses.replace(papers.config, **changes)
+        papers = target_grasps(problem.shelf, problem.gripper, problem.target, config)
+    assert can_be_joined((own, papers)) == (not changes)
     for scenario in (OPEN, SILL, HIDDEN):
         here = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
         objects, pose = objects_on_the_board(here), true_target_pose(here.world)
-        alone = [bool(best_grasp(grasps, objects, pose).success) for grasps in sets]
-        assert [bool(free) for free in free_in_sets(sets, objects, pose)] == alone
-        assert not any(free_in_sets(sets, objects, pose, jnp.array(False)))
+        alone = [bool(best_grasp(grasps, objects, pose).success) for grasps in (own, papers)]
+        assert [bool(free) for free in free_in_sets((own, papers), objects, pose)] == alone
+    assert not any(free_in_sets((own, papers), objects, pose, jnp.array(False)))
 
 
-def test_sets_with_other_settings_are_not_joined(problem):
+def test_sets_that_are_tested_otherwise_are_not_joined(problem):
     usual = problem.target_grasps
     other = usual.replace(config=dataclasses.replace(usual.config, waypoints=3))
     with pytest.raises(ValueError, match="waypoints"):

@@ -19,6 +19,7 @@ from mechsearch_jax.geometry.transforms import compose, transform
 from mechsearch_jax.planner import Problem, paper
 from mechsearch_jax.retrieval import (
     TargetGrasps,
+    can_be_joined,
     found_grasps,
     found_hits,
     joined,
@@ -96,12 +97,14 @@ def free_in_sets(
     active: Bool[Array, ""] | bool = True,
 ) -> list[Bool[Array, ""]]:
     """For each set of grasps of a target whether one hits nothing on its whole way: `best_grasp(...).success` of each,
-    without a ranking, and in one program.
+    without a ranking, and all together where their grasps are tested alike.
 
     Args:
       sets: of the same target.
       scene, pose, active: as of `best_grasp`.
     """
+    if not can_be_joined(sets):
+        return [free for one in sets for free in free_in_sets([one], scene, pose, active)]
     grasps = joined(sets)
     found = found_grasps(grasps, grasps.standing(pose), active)
     free = found.feasible & ~jnp.any(found_hits(grasps, found, scene, active), axis=1)
