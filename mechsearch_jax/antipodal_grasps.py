@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.compound_grasps import BODY_POINTS, OpenHand, held
+from mechsearch_jax.geometry.spreading import farthest_points
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, swept_cloud
 from mechsearch_jax.shapes.compound import Compound
@@ -148,9 +149,9 @@ def spread(features: Float[np.ndarray, "n f"], count: int) -> Int[np.ndarray, " 
     """Rows that are far from each other, each the farthest from all before; the first is the nearest to the middle."""
     if not len(features):
         return np.zeros(0, int)
-    chosen = [int(np.argmin(np.linalg.norm(features - features.mean(axis=0), axis=1)))]
-    away = np.full(len(features), np.inf)
-    while len(chosen) < min(count, len(features)):
-        away = np.minimum(away, np.sum((features - features[chosen[-1]]) ** 2, axis=1))
-        chosen.append(int(np.argmax(away)))
-    return np.array(chosen)
+    middle = int(np.argmin(np.linalg.norm(features - features.mean(axis=0), axis=1)))
+
+    def from_row(last: int) -> Float[np.ndarray, " n"]:
+        return np.sum((features - features[last]) ** 2, axis=1)
+
+    return farthest_points(min(count, len(features)), middle, from_row)

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -116,6 +117,38 @@ def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspC
       InputError: the target is too wide for the gripper.
     """
     return TargetGrasps(grasp_tables(gripper, target, config), shelf, gripper, target, config)
+
+
+def can_be_joined(sets: Sequence[TargetGrasps]) -> bool:
+    """Whether several sets of grasps for the same target can be `joined`: they may differ in which grasps there are,
+    but not in how grasps are tested."""
+
+    def tested(one: TargetGrasps) -> tuple[Any, ...]:
+        tables, config = one.tables, one.config
+        shapes = tables.clouds.shape[1:], tables.still_gripper.shape[1:], tables.still_target.shape
+        return config.waypoints, config.max_yaw, shapes
+
+    return len({tested(one) for one in sets}) == 1
+
+
+def joined(sets: Sequence[TargetGrasps]) -> TargetGrasps:
+    """All grasps of several sets for the same target, in order, as one set.
+
+    Raises:
+      ValueError: they cannot be joined.
+    """
+    if not can_be_joined(sets):
+        raise ValueError("joined: the sets differ in waypoints, max_yaw or the numbers of points")
+    first, tables = sets[0], [one.tables for one in sets]
+    # Each set has its own wrists.
+    before = np.cumsum([0, *(len(table.still_gripper) for table in tables)])
+    fields: dict[str, Any] = {
+        name: jnp.concatenate([getattr(table, name) for table in tables])
+        for name in ("T_target_gripper", "q7", "clouds", "low", "high", "still_gripper")
+    }
+    wrist = jnp.concatenate([table.wrist + np.int32(start) for table, start in zip(tables, before, strict=False)])
+    gap = jnp.max(jnp.stack([jnp.asarray(table.gap) for table in tables]))
+    return first.replace(tables=GraspTables(**fields, wrist=wrist, still_target=tables[0].still_target, gap=gap))
 
 
 def no_grasps(grasps: TargetGrasps) -> FoundGrasps:

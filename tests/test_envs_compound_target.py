@@ -12,7 +12,7 @@ import trimesh
 from test_envs_simulator import pose, take_out
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe, target_pixels
-from mechsearch_jax.envs.camera.snapshot import Snapshot, sight_of
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, sight_of
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.recording.body_solids import body_points, body_solids
 from mechsearch_jax.envs.simulators.batch_model import cells_of
@@ -34,6 +34,7 @@ from mechsearch_jax.envs.world.world import (
     slots,
     with_target,
 )
+from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
@@ -103,6 +104,24 @@ def test_a_plain_world_gets_the_targets_pieces():
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(world), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
     assert with_target(plain, Target.box()) is plain
+
+
+def test_objects_beside_a_compound_target_have_parts_only_if_one_is_a_compound():
+    """With parts all programs of a decision are twice as large."""
+
+    def seen(scene):
+        return Snapshot(Camera(), SHELF, from_scenario(scene))
+
+    objects = objects_on_the_board(seen(hidden(MUG, BOX)))
+    assert objects.parts is None
+    plain = objects_on_the_board(seen(Scenario("plain", (BOX,), standing(Target.cylinder()))))
+    jax.tree.map(np.testing.assert_array_equal, objects, plain)
+    assert oracle(jax.random.key(0), seen(hidden(MUG, BOX))).objects.parts is None
+    both = hidden(MUG, BOX, standing(TALL, x=0.5, y=-0.1))
+    assert objects_on_the_board(seen(both)).parts.capacity == PARTS
+    # Where it is not known which bodies are compounds, all have room for parts.
+    traced = jax.eval_shape(lambda world: objects_on_the_board(Snapshot(Camera(), SHELF, world)), seen(both).world)
+    assert traced.parts.capacity == PARTS
 
 
 def test_the_camera_sees_the_target_in_its_own_colour():

@@ -137,10 +137,15 @@ def test_depth_is_that_of_the_rays_of_mujoco(seed):
     assert apart.max() < 1e-3
 
 
-def test_normals_are_those_of_the_depth():
+BALL_PIECE = Piece(CONVEX, (0.0,) * 3, vertices=BALL)
+ROOF = tuple((x, y, z) for z, wide in ((-0.05, 0.04), (0.05, 0.01)) for x in (-wide, wide) for y in (-0.04, 0.04))
+
+
+@pytest.mark.parametrize("pieces", [MUG, (Piece(CONVEX, (0.0,) * 3, vertices=ROOF),)], ids=["mug", "polyhedron"])
+def test_normals_are_those_of_the_depth(pieces):
     """The normal of a body's smooth parts is the cross product of differences of its points in the image."""
     camera = Camera().scaled(2)
-    scene = Scenario("one", (body(*MUG, place=(0.55, 0.1, 0.4545)),), TARGET_BODY)
+    scene = Scenario("one", (body(*pieces, place=(0.55, 0.1, 0.4545)),), TARGET_BODY)
     plain = simulated_camera.Appearance(np.ones((10, 3), np.float32), np.array((0.0, 0.0, 1.0)))
     seen = simulated_camera.observe(camera, world.from_scenario(scene), None, plain)
     depth = np.asarray(seen.depth)
@@ -148,9 +153,24 @@ def test_normals_are_those_of_the_depth():
     cross = np.cross(np.diff(points, axis=1)[:-1], np.diff(points, axis=0)[:, :-1])
     cross /= np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
     light = simulated_camera.AMBIENT + (1 - simulated_camera.AMBIENT) * np.maximum(np.abs(cross[..., 2]), 0.0)
-    on_mug = (np.asarray(seen.segmentation) == 0)[:-1, :-1]
-    assert on_mug.sum() > 500
-    assert np.median(np.abs(np.asarray(seen.colour)[:-1, :-1, 0] - light)[on_mug]) < 0.01
+    on_body = (np.asarray(seen.segmentation) == 0)[:-1, :-1]
+    assert on_body.sum() > 500
+    assert np.median(np.abs(np.asarray(seen.colour)[:-1, :-1, 0] - light)[on_body]) < 0.01
+
+
+def test_polyhedra_look_alone_as_they_do_side_by_side():
+    """Rays are cut only where they come near one, which a batch does for all its worlds together."""
+    here = Scenario("here", (body(BALL_PIECE, place=(0.5, -0.1, 0.45)), BOX), TARGET_BODY)
+    there = Scenario("there", (body(BALL_PIECE, place=(0.65, 0.2, 0.6), turn=ON_ITS_SIDE), BOX), TARGET_BODY)
+    worlds = [world.from_scenario(scene) for scene in (here, there)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *worlds)
+    both = jax.jit(jax.vmap(lambda one: simulated_camera.observe(CAMERA, one)))(stacked)
+    for i, one in enumerate(worlds):
+        alone = simulated_camera.observe(CAMERA, one)
+        assert (np.asarray(alone.segmentation) == 0).sum() > 20
+        np.testing.assert_array_equal(both.segmentation[i], alone.segmentation)
+        np.testing.assert_allclose(both.depth[i], alone.depth, atol=1e-5)
+        np.testing.assert_allclose(both.colour[i], alone.colour, atol=1e-4)
 
 
 def test_compounds_have_their_own_colours():

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, SILL, Stage, grab, reveal
 
-from mechsearch_jax.envs.camera.snapshot import Snapshot
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.episode import verdicts
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
-from mechsearch_jax.envs.episode.verdicts import Verdict, judge, paper_grasps
+from mechsearch_jax.envs.episode.verdicts import Verdict, free_in_sets, judge, paper_grasps
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.retrieval import target_grasps
+from mechsearch_jax.retrieval import best_grasp, can_be_joined, joined, target_grasps
 from mechsearch_jax.workspace.target import Target
 
 
@@ -51,21 +51,36 @@ def test_steeper_grasps_reach_over_what_the_papers_do_not(problem):
     assert "paper" not in verdict(dataclasses.replace(alone[1], steps=tuple(unknown)))
 
 
-def test_the_papers_grasps_do_not_depend_on_the_methods(problem, monkeypatch):
+def test_the_papers_grasps_do_not_depend_on_the_methods(problem):
     steep = GraspConfig(tilts=(math.radians(30),))
     grasps = target_grasps(problem.shelf, problem.gripper, problem.target, steep)
     config = dataclasses.replace(problem.config, grasps=steep, retrieval=steep)
     other = problem.replace(retrieval=grasps.tables, config=config)
-    # Nothing is to be compiled for its grasps.
-    choice = type("Choice", (), {"success": jnp.array(True)})
-    best = verdicts.best_grasp
-    own = lambda grasps: grasps.config == steep  # noqa: E731
-    monkeypatch.setattr(verdicts, "best_grasp", lambda grasps, *scene: choice if own(grasps) else best(grasps, *scene))
-    traced = best._cache_size()
     for scenario, expected in ((OPEN, True), (SILL, False)):
         here = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
-        assert judge(other, here) == Verdict(True, expected)
-    assert best._cache_size() <= traced + 1
+        assert judge(other, here).paper_graspable == expected
+
+
+@pytest.mark.parametrize("changes", [{}, {"waypoints": 3}, {"points": 1024}], ids=["alike", "waypoints", "points"])
+def test_sets_of_grasps_are_judged_together_as_each_alone(problem, changes):
+    own, papers = verdicts.judged_sets(problem)
+    if changes:
+        config = dataclasses.replace(papers.config, **changes)
+        papers = target_grasps(problem.shelf, problem.gripper, problem.target, config)
+    assert can_be_joined((own, papers)) == (not changes)
+    for scenario in (OPEN, SILL, HIDDEN):
+        here = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
+        objects, pose = objects_on_the_board(here), true_target_pose(here.world)
+        alone = [bool(best_grasp(grasps, objects, pose).success) for grasps in (own, papers)]
+        assert [bool(free) for free in free_in_sets((own, papers), objects, pose)] == alone
+    assert not any(free_in_sets((own, papers), objects, pose, jnp.array(False)))
+
+
+def test_sets_that_are_tested_otherwise_are_not_joined(problem):
+    usual = problem.target_grasps
+    other = usual.replace(config=dataclasses.replace(usual.config, waypoints=3))
+    with pytest.raises(ValueError, match="waypoints"):
+        joined([usual, other])
 
 
 def test_nothing_is_judged_where_nothing_stands(problem):

@@ -418,6 +418,19 @@ def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem
     assert after[2] <= counts[2] + 1
 
 
+@pytest.mark.slow
+def test_candidate_poses_do_not_count_once_a_target_is_found_that_stays(decision, problem):
+    objects, pose = decision[0], (0.7, 0.2, 0.0)
+    belief = look(problem, objects, True, pose)
+    key = jax.random.key(3)
+    with_all = policies._plan(POLICY._planning, key, problem, belief, seen(objects, True, pose))
+    alone = POLICY.planned(key, problem, belief, seen(objects, True, pose))
+    jax.tree.map(np.testing.assert_array_equal, alone, with_all)
+    # One that may be pushed is judged where it would then be.
+    pushed = POLICY.replace(config=dataclasses.replace(POLICY.config, move_target=True))
+    assert pushed._planned_with(problem, belief)[1].exists.shape == belief.exists.shape
+
+
 def test_continuous_settings_are_data_and_compile_nothing(decision, problem):
     objects, belief, usual = decision
     count = policies._plan._cache_size()

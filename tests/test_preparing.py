@@ -6,20 +6,25 @@ import time
 import jax
 import pytest
 
-from mechsearch_jax.actions import KINDS
-from mechsearch_jax.belief.belief import graspability_map, initial_belief
+from mechsearch_jax.actions import KINDS, no_action
+from mechsearch_jax.belief.belief import graspability_map, initial_belief, update_belief
+from mechsearch_jax.commands.search import _expected
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
 from mechsearch_jax.envs.episode import verdicts
 from mechsearch_jax.envs.recording import evidence
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.planner import search_for_grasp
-from mechsearch_jax.retrieval import best_grasp, worth_trying
+from mechsearch_jax.geometry.bodies import PARTS
+from mechsearch_jax.planner import policies, search_for_grasp
+from mechsearch_jax.retrieval import worth_trying
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.session import preparing
 from mechsearch_jax.session.preparing import Preparing, Program, first_decision, motions, prepare, prepared
-from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.shapes.compound import Piece
+from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 
 def program(name, ready=False, prepare=lambda: None):
@@ -132,8 +137,24 @@ def test_a_policy_of_a_users_own_is_compiled_when_it_is_called(problem):
     assert names(search_for_grasp()) == ["plan", *others]
 
 
-def test_what_later_steps_need_is_what_they_call(problem, monkeypatch):
-    """The programs that a search compiles ahead are for the arguments that it then has."""
+MUG = Target.from_parts((Piece("cylinder", (0.03, 0.03, 0.05)), Piece("box", (0.02, 0.005, 0.03), (0.04, 0.0, 0.0))))
+
+
+def standing(target, x):
+    position = (x, 0.1, Shelf().board + target.bottom)
+    return Body(target.shape, target.half_size, position, (1.0, 0.0, 0.0, 0.0), target.compound)
+
+
+CASES = {
+    "usual": (standing(Target.box(), 0.5), standing(Target.cylinder(), 0.65)),
+    "compound-target": (standing(Target.box(), 0.5), standing(MUG, 0.65)),
+    "compound-object": (standing(MUG, 0.5), standing(Target.cylinder(), 0.65)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_a_search_compiles_ahead_is_what_it_calls(problem, monkeypatch, case):
+    """The programs are for the arguments that a search then has."""
     calls = {}
 
     def noted(name, function, *args):
@@ -143,23 +164,42 @@ def test_what_later_steps_need_is_what_they_call(problem, monkeypatch):
     for module in (preparing, verdicts, evidence):
         monkeypatch.setattr(module, "program", noted)
     policy = search_for_grasp(tries=True)
-    preparing.retrieval(problem, policy)
-    verdicts.programs(problem)
-    evidence.programs(problem)
-    snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(load_scenario(example_scenarios()["first-light"])))
+    *objects, target = CASES[case]
+    scene = Scenario(case, tuple(objects), target)
+    there, recognised = _expected(scene, "oracle")
+    preparing.decision(problem, policy, recognised)
+    preparing.retrieval(problem, policy, recognised)
+    verdicts.programs(problem, there.objects)
+    evidence.programs(problem, recognised.objects, there.objects)
+    snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scene))
     seen, pose = oracle(jax.random.key(0), snapshot), true_target_pose(snapshot.world)
     there, belief = objects_on_the_board(snapshot), initial_belief(problem)
     expected = {
+        "belief": [(update_belief, (problem, belief, seen, seen, no_action()))],
         "grasp": [(worth_trying, (problem.target_grasps, seen.objects, belief.found_pose))],
-        "verdict": [(best_grasp, (grasps, there, pose)) for grasps in verdicts.judged_sets(problem)],
+        "verdict": [(verdicts.free_in_sets, (verdicts.judged_sets(problem), there, pose))],
         "hits": [(evidence.grasps_at, (problem.target_grasps, there, pose))],
         "g": [(graspability_map, (problem, belief, seen.objects))],
     }
+    ((planner, arguments),) = calls.pop("plan")
+    assert planner is policy
+    planned = (jax.random.key(0), problem, belief, seen)
+    assert policies._plan._call_key((policy, *arguments), {}) == policies._plan._call_key((policy, *planned), {})
 
     def keys(each):
         return {name: [(f, f._call_key(args, {})) for f, args in pairs] for name, pairs in each.items()}
 
     assert keys(calls) == keys(expected)
+
+
+@pytest.mark.parametrize(
+    ("recognition", "parts"), [("masks", None), ("full", None), ("masks-parts", PARTS), ("full-parts", PARTS)]
+)
+def test_bodies_that_are_recognised_have_parts_where_the_recogniser_gives_them(recognition, parts):
+    *objects, target = CASES["compound-object"]
+    there, recognised = _expected(Scenario("one", tuple(objects), target), recognition)
+    assert there.objects.parts.capacity == PARTS
+    assert (recognised.objects.parts.capacity if parts else recognised.objects.parts) == parts
 
 
 def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.world.compounds import Solids
 from mechsearch_jax.envs.world.world import BODIES, CompoundWorld
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import CONVEX_CODE, MOST_SOLIDS
@@ -19,6 +20,10 @@ from mechsearch_jax.workspace.camera import Camera
 NONE = -1
 # By so much the cone of rays is taken to be wider, for rounding [rad].
 VIEW_MARGIN = 1e-3
+# By so much the sphere around a polyhedron is taken to be larger, for rounding.
+SLACK = 1e-3
+# Rays that are cut, and points whose normals are found, at once.
+RAYS, POINTS = 4096, 1024
 
 
 def placed(world: CompoundWorld) -> Solids:
@@ -79,8 +84,26 @@ def _cast(camera: Camera, solids: Solids, i: Array, directions: Array) -> Array:
     direction = [rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z for k in range(3)]
     cuts = [partial(primitive.cut, origin, direction, solids.half_size[i], jnp) for primitive in PRIMITIVES.values()]
     if solids.faces.shape[-2]:
-        cuts.append(partial(cut_polyhedron, origin, direction, solids.faces[i]))
+        radius = jnp.linalg.norm(solids.half_size[i])
+        cuts.append(partial(_cut_in_reach, origin, direction, solids.faces[i], radius))
     return jax.lax.switch(solids.kind[i], cuts)
+
+
+def _cut_in_reach(
+    origin: list[Array], direction: list[Array], faces: Float[Array, "f 4"], radius: Float[Array, ""]
+) -> Float[Array, "*pixels"]:
+    """`cut_polyhedron`, computed only for rays that come within a radius of its frame's origin: few of an image's."""
+    start, rays = jnp.stack(origin), jnp.stack([d.reshape(-1) for d in direction], axis=-1)
+    along = jnp.sum(rays * start[None], axis=-1)
+    squared = jnp.sum(start**2) - along**2 / jnp.sum(rays**2, axis=-1)
+    near = squared <= ((1.0 + SLACK) * radius) ** 2
+
+    def cut(_, body, ray):
+        start, faces = body
+        return cut_polyhedron(list(start), list(ray), faces)
+
+    depth = masked_vmap(cut, near, None, (start, faces), rays, block=RAYS)
+    return jnp.where(near, depth, jnp.inf).reshape(direction[0].shape)
 
 
 def cut_polyhedron(origin: list[Array], direction: list[Array], faces: Float[Array, "f 4"]) -> Float[Array, "*pixels"]:
@@ -120,19 +143,22 @@ def solid_normals(world: CompoundWorld, points: Float[Array, "n 3"], solid: Int[
     for primitive in PRIMITIVES.values():
         chosen = jnp.where(kind == primitive.code, primitive.normal(local, half, jnp), chosen)
     if solids.faces.shape[-2]:
-        chosen = jnp.where(kind == CONVEX_CODE, _nearest_face(solids, row, local), chosen)
+        chosen = jnp.where(kind == CONVEX_CODE, _nearest_face(solids, row, local, solid >= 0), chosen)
     chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
     return rotate(rotation, chosen)
 
 
-def _nearest_face(solids: Solids, row: Array, local: Array) -> Array:
-    """The normal of the face of each point's polyhedron that it is farthest outside of; one face after the other."""
+def _nearest_face(
+    solids: Solids, row: Int[Array, " n"], local: Float[Array, "n 3"], hit: Bool[Array, " n"]
+) -> Float[Array, "n 3"]:
+    """The normal of the face of each point's polyhedron that it is farthest outside of; any where no polyhedron is
+    hit."""
 
-    def farther(f, best):
-        height, normal = best
-        face = solids.faces[:, f][row]
-        above = jnp.sum(face[:, :3] * local, axis=-1) - face[:, 3]
-        return jnp.maximum(height, above), jnp.where((above > height)[:, None], face[:, :3], normal)
+    def farthest(_, faces, point):
+        local, row = point
+        own = faces[row]
+        height = own[:, :3] @ local - own[:, 3]
+        return own[jnp.argmax(height), :3]
 
-    start = jnp.full(len(local), -jnp.inf, local.dtype), jnp.zeros_like(local)
-    return jax.lax.fori_loop(0, solids.faces.shape[-2], farther, start)[1]
+    on_polyhedron = hit & (solids.kind[row] == CONVEX_CODE)
+    return masked_vmap(farthest, on_polyhedron, None, solids.faces, (local, row), block=POINTS)

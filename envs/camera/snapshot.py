@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, resized, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window, window_of
-from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
+from mechsearch_jax.envs.world.world import TARGET, World, plain_objects, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.observation import Observation
@@ -215,8 +215,8 @@ def _seen_objects(snapshot: Snapshot) -> Superquadrics:
 
 
 def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
-    """The true objects, without those that have fallen off the board."""
-    return _on_the_board(snapshot.world, snapshot.shelf)
+    """The true objects, without those that have fallen off the board; without parts where none is a compound."""
+    return _on_the_board(plain_objects(snapshot.world), snapshot.shelf)
 
 
 @kept()

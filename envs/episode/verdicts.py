@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
@@ -16,10 +17,19 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, transform
 from mechsearch_jax.planner import Problem, paper
-from mechsearch_jax.retrieval import TargetGrasps, best_grasp, no_grasps, straight_hits, target_grasps
+from mechsearch_jax.retrieval import (
+    TargetGrasps,
+    can_be_joined,
+    found_grasps,
+    found_hits,
+    joined,
+    no_grasps,
+    straight_hits,
+    target_grasps,
+)
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import kept
-from mechsearch_jax.session.preparing import Program, nothing_seen, program
+from mechsearch_jax.session.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 from mechsearch_jax.workspace.target import Target
@@ -54,15 +64,12 @@ def paper_grasps(shelf: Shelf, gripper: Gripper, target: Target) -> TargetGrasps
 def judge(problem: Problem, snapshot: Snapshot) -> Verdict:
     """The verdict on a single scene."""
     objects, pose = objects_on_the_board(snapshot), true_target_pose(snapshot.world)
-    # Called as the policies call it, so that nothing is compiled twice.
-    free = [best_grasp(grasps, objects, pose).success for grasps in judged_sets(problem)]
-    return Verdict(*map(bool, jax.device_get(free)))
+    return Verdict(*map(bool, jax.device_get(free_in_sets(judged_sets(problem), objects, pose))))
 
 
-def programs(problem: Problem) -> list[Program]:
-    """The programs of `judge` that take long to compile."""
-    objects, pose = nothing_seen().objects, jnp.zeros(3)
-    return [program("verdict", best_grasp, grasps, objects, pose) for grasps in judged_sets(problem)]
+def programs(problem: Problem, objects: Superquadrics) -> list[Program]:
+    """The programs of `judge` that take long to compile, for such objects."""
+    return [program("verdict", free_in_sets, judged_sets(problem), objects, jnp.zeros(3))]
 
 
 def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> list[Verdict]:
@@ -80,6 +87,29 @@ def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> li
 def judged_sets(problem: Problem) -> tuple[TargetGrasps, TargetGrasps]:
     """The sets of grasps of a `Verdict`, in its order."""
     return problem.target_grasps, paper_grasps(problem.shelf, problem.gripper, problem.target)
+
+
+@kept()
+def free_in_sets(
+    sets: Sequence[TargetGrasps],
+    scene: Superquadrics,
+    pose: Float[Array, " 3"],
+    active: Bool[Array, ""] | bool = True,
+) -> list[Bool[Array, ""]]:
+    """For each set of grasps of a target whether one hits nothing on its whole way: `best_grasp(...).success` of each,
+    without a ranking, and all together where their grasps are tested alike.
+
+    Args:
+      sets: of the same target.
+      scene, pose, active: as of `best_grasp`.
+    """
+    if not can_be_joined(sets):
+        return [free for one in sets for free in free_in_sets([one], scene, pose, active)]
+    grasps = joined(sets)
+    found = found_grasps(grasps, grasps.standing(pose), active)
+    free = found.feasible & ~jnp.any(found_hits(grasps, found, scene, active), axis=1)
+    ends = np.cumsum([len(one.tables.q7) for one in sets])[:-1]
+    return [jnp.any(part) for part in jnp.split(free, ends)]
 
 
 def swept_free(
@@ -118,6 +148,6 @@ def graspable_many(
 
     def graspable(world, active):
         objects = objects_on_the_board(Snapshot(camera, sets[0].shelf, world))
-        return [best_grasp(grasps, objects, true_target_pose(world), active).success for grasps in sets]
+        return free_in_sets(sets, objects, true_target_pose(world), active)
 
     return jax.vmap(graspable)(worlds, active)

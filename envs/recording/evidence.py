@@ -26,7 +26,7 @@ from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.retrieval import TargetGrasps, found_grasps, found_hits
 from mechsearch_jax.runtime.compiled import kept
-from mechsearch_jax.session.preparing import Program, nothing_seen, program
+from mechsearch_jax.session.preparing import Program, program
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
 # Of so many of the best candidates the predicted f and g are kept, and of the best that moves another object.
@@ -100,12 +100,16 @@ def evidence(moment: Moment, problem: Problem) -> Evidence:
     )
 
 
-def programs(problem: Problem) -> list[Program]:
-    """The programs of `evidence` that take long to compile, but for those of a first decision."""
-    objects = nothing_seen().objects
+def programs(problem: Problem, seen: Superquadrics, there: Superquadrics) -> list[Program]:
+    """The programs of `evidence` that take long to compile, but for those of a first decision.
+
+    Args:
+      problem: of the search.
+      seen, there: objects with the shapes of those that are recognised, and of those that are there.
+    """
     return [
-        program("hits", grasps_at, problem.target_grasps, objects, jnp.zeros(3)),
-        program("g", graspability_map, problem, initial_belief(problem), objects),
+        program("hits", grasps_at, problem.target_grasps, there, jnp.zeros(3)),
+        program("g", graspability_map, problem, initial_belief(problem), seen),
     ]
 
 

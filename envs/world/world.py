@@ -10,6 +10,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -213,6 +214,18 @@ def superquadrics(world: World) -> Superquadrics:
         return scene.replace(valid=scene.valid & world.valid)
     exponents = jnp.array([shape.exponents for shape in in_order()])
     return Superquadrics(world.half_size, exponents[world.kind], world.position, world.rotation, world.valid)
+
+
+def plain_objects(world: World) -> World:
+    """The world as a plain one, with the box around the target, if none of its objects is a compound.
+
+    Objects of a plain world are superquadrics without parts, with which all of a planner's programs are half as large.
+    Inside of programs, where it is not known which bodies are compounds, the world stays as it is.
+    """
+    if not isinstance(world, CompoundWorld) or isinstance(world.compounds.compound, Tracer):
+        return world
+    objects = np.asarray(world.compounds.compound)[..., :TARGET]
+    return world if objects.any() else World(**_fields(world))
 
 
 def true_superquadrics(world: World) -> Superquadrics:

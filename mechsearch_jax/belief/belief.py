@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions.types import Action
@@ -127,6 +130,22 @@ def without_grasps(belief: Belief) -> Belief:
     return belief.replace(grasps=grasps.replace(feasible=grasps.feasible[..., :0], q=grasps.q[..., :0, :, :]))
 
 
+def without_candidates(problem: Problem, belief: Belief) -> tuple[Problem, Belief]:
+    """Problem and belief without candidate poses (X = 0), for programs that are traced for a target that is found and
+    stays where it is.
+
+    f is 0 at all of them then, and g counts at the found pose alone: without them, nothing is computed for them.
+    """
+
+    def none(table: Any, *names: str) -> Any:
+        rows = ((name, getattr(table, name)) for name in names)
+        return table.replace(**{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in rows})
+
+    existence = none(problem.existence, "T_world_target", "depth", "corner", "middle", "nearest")
+    grasps = none(problem.grasps, "T_world_target", "pair_pose", "pair_grasp", "pair_valid", "pose_pairs")
+    return problem.replace(existence=existence, grasps=grasps), none(belief, "exists", "allowed")
+
+
 def possible_poses(
     belief: Belief, exists: Bool[Array, " x"], target_at: Bool[Array, " x"] | None = None
 ) -> Bool[Array, " y"]:
@@ -145,7 +164,11 @@ def possible_poses(
 
 def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
     """Raster of the space that a hidden target may take; empty once it is found, when it is an ordinary obstacle."""
-    grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
+    if exists.shape[-1] == 0:
+        # See `without_candidates`. No constant: XLA would compute with that as it compiles.
+        grid = jnp.broadcast_to(jnp.int32(~belief.found), problem.target.grid)
+    else:
+        grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
     return PossibleSpace(
         occupied=widen(grid > 0),
         chance=grid / jnp.maximum(jnp.sum(grid), 1),

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.episode.records import Episode
     from mechsearch_jax.envs.recording.narration import Narrator
     from mechsearch_jax.envs.recording.recording import Recorder, Recording
+    from mechsearch_jax.observation import Observation
     from mechsearch_jax.planner import Problem
     from mechsearch_jax.problem.settings import Settings
     from mechsearch_jax.session.preparing import Preparing
@@ -121,7 +122,8 @@ def _run(
     from mechsearch_jax.session.preparing import decision, retrieval
 
     policy, workcell = chosen.policy(), chosen.workcell
-    preparing.add(decision(problem, policy))
+    there, seen = _expected(scene, chosen.recognition)
+    preparing.add(decision(problem, policy, seen))
     # These take long to import; meanwhile the first decision's program is read or compiled.
     from mechsearch_jax.envs.episode import verdicts
     from mechsearch_jax.envs.recording import evidence
@@ -130,8 +132,10 @@ def _run(
     from mechsearch_jax.envs.simulators.native import NativeSimulator
 
     # Later steps need these, or most searches do.
-    later = [*retrieval(problem, policy), *(evidence.programs(problem) if records else ())]
-    preparing.add([*later, *verdicts.programs(problem)], optional=True)
+    later = [*retrieval(problem, policy, seen), *verdicts.programs(problem, there.objects)]
+    if records:
+        later += evidence.programs(problem, seen.objects, there.objects)
+    preparing.add(later, optional=True)
     simulator = NativeSimulator(
         config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
     )
@@ -147,6 +151,18 @@ def _run(
     start = Start(scene, seed, mismatch=chosen.mismatch)
     episode = run_episode(start, problem, policy, simulator, settings, narrator)
     return episode, narrator, recorder
+
+
+def _expected(scene: Scenario, recognition: str) -> tuple[Observation, Observation]:
+    """Observations of nothing with the shapes of what is there and of what is recognised: programs depend on whether
+    bodies have parts."""
+    from mechsearch_jax.geometry.bodies import PARTS
+    from mechsearch_jax.session.preparing import nothing_seen
+
+    there = nothing_seen(PARTS if any(body.compound for body in scene.objects) else None)
+    if recognition in ("oracle", "informed"):
+        return there, there
+    return there, nothing_seen(PARTS if recognition.endswith("-parts") else None)
 
 
 def search(
@@ -191,13 +207,13 @@ def search(
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
-        scene = make_scene()
-        console.print(
-            f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
-        )
         with Preparing(lambda text: console.print(text, style="dim")) as preparing:
-            # They depend on nothing else, and are compiled while the problem is built.
+            # They depend on nothing else, and are compiled while a mesh is cut, the scene made and the problem built.
             preparing.add(motions(SimulatorConfig().motion))
+            scene = make_scene()
+            console.print(
+                f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
+            )
             problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
             episode, narrator, recorder = _run(status, preparing, chosen, scene, problem, seed, keeps.records)
         # Imported late: they take long.
@@ -217,10 +233,10 @@ def search(
 def _scene(
     scenario: str | None, generated: Generated, seed: int, settings: Settings, shelf: Shelf
 ) -> Callable[[], Scenario]:
-    """A function that makes the scene; a scenario file is read immediately.
+    """A function that makes the scene, which takes seconds where a mesh is cut; a scenario file is read immediately.
 
     Raises:
-      InputError: the file cannot be used.
+      InputError: a file cannot be used; that of a target raises it in the function.
     """
     from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -228,5 +244,4 @@ def _scene(
     if scenario is not None:
         loaded = load_scenario(find_scenario(scenario), shelf)
         return lambda: loaded
-    target = generated.hides.load()
-    return lambda: ScenarioGenerator.of(settings, target).generate(seed, generated.objects or 0)
+    return lambda: ScenarioGenerator.of(settings, generated.hides.load()).generate(seed, generated.objects or 0)

@@ -11,6 +11,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from mechsearch_jax.geometry import spreading
+from mechsearch_jax.geometry.spreading import farthest_points
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
 
 Kind = Literal["box", "capsule"]
@@ -30,7 +32,8 @@ def cloud_of(
       distance: length of the way along z, which ends where the solids are [m].
       seed: equal seeds give equal points.
     """
-    source = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    files = (Path(__file__), Path(spreading.__file__))
+    source = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     key = repr((solids, front, fine, count, distance, seed, source, trimesh.__version__, np.__version__))
     make = functools.partial(_cloud, solids, front, fine, count, distance, seed)
     return kept_arrays("cloud", key, lambda: {"points": make()})["points"]
@@ -96,23 +99,20 @@ def _outside(points: np.ndarray, hulls: list[_Hull]) -> np.ndarray:
 
 
 def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
-    """Indices of `count` points by farthest-point sampling, with distances relative to the spacing."""
-    chosen = np.empty(count, int)
-    chosen[0] = np.argmax(points[:, 2])
-    gap = np.full(len(points), np.inf)
+    """Indices of `count` points by farthest-point sampling, with distances relative to the spacing; the first is the
+    one with the largest z."""
     x, y, z = np.array(points.T, order="C")
     scale = spacing**2
-    distance, square = np.empty_like(gap), np.empty_like(gap)
-    # Column by column and in place, for this loop takes most of a cloud's time.
-    for i in range(1, count):
-        last = chosen[i - 1]
+    distance, square = np.empty(len(points)), np.empty(len(points))
+
+    # Column by column and in place, for this takes most of a cloud's time.
+    def from_point(last: int) -> np.ndarray:
         np.subtract(x, x[last], out=distance)
         np.multiply(distance, distance, out=distance)
         for axis in (y, z):
             np.subtract(axis, axis[last], out=square)
             np.multiply(square, square, out=square)
             np.add(distance, square, out=distance)
-        np.divide(distance, scale, out=distance)
-        np.minimum(gap, distance, out=gap)
-        chosen[i] = np.argmax(gap)
-    return chosen
+        return np.divide(distance, scale, out=distance)
+
+    return farthest_points(count, int(np.argmax(points[:, 2])), from_point)

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.belief.belief import Belief, without_grasps
+from mechsearch_jax.belief.belief import Belief, without_candidates, without_grasps
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
@@ -123,15 +123,24 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         """The policy with the usual `tries` and `retrieval_contact`, on which a plan does not depend: compiled once."""
         return self.replace(tries=False, config=dataclasses.replace(self.config, retrieval_contact=True))
 
+    def _planned_with(self, problem: Problem, belief: Belief) -> tuple[Problem, Belief]:
+        """The problem and the belief that a plan is compiled for: outside of transformations separate, smaller programs
+        for a target that is hidden, and for one that is found and that actions leave where it is."""
+        if isinstance(belief.found, Tracer) or jnp.ndim(belief.found) > 0:
+            return problem, belief
+        if not belief.found:
+            return problem, without_grasps(belief)
+        return (problem, belief) if self.config.move_target else without_candidates(problem, belief)
+
     def begin(
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
     ) -> Callable[[], None] | None:
         """Lower the plan for such arguments without planning; see `runtime.compiled.Kept.begin`."""
-        return _plan.begin(self._planning, key, problem, _belief_of_plan(belief), observation)
+        return _plan.begin(self._planning, key, *self._planned_with(problem, belief), observation)
 
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
         """Whether the plan for such arguments is compiled; see `runtime.compiled.Kept.is_ready`."""
-        return _plan.is_ready(self._planning, key, problem, _belief_of_plan(belief), observation)
+        return _plan.is_ready(self._planning, key, *self._planned_with(problem, belief), observation)
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
@@ -174,17 +183,11 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         Args:
           key, problem, belief, observation: as of a `Policy`.
         """
-        decision = _plan(self._planning, key, problem, _belief_of_plan(belief), observation)
+        decision = _plan(self._planning, key, *self._planned_with(problem, belief), observation)
         if not self.tries:
             return decision
         reached = jnp.float32(self.objective.reached)
         return decision.replace(alternatives=sequences_to_try(decision.sequences, observation.objects, reached))
-
-
-def _belief_of_plan(belief: Belief) -> Belief:
-    """The belief that a plan is compiled for: a separate, smaller program if the target is not found."""
-    hidden = not isinstance(belief.found, Tracer) and jnp.ndim(belief.found) == 0 and not belief.found
-    return without_grasps(belief) if hidden else belief
 
 
 def _grasps_first(grasp: Decision, planned: Decision) -> Decision:

@@ -118,8 +118,12 @@ class Rollout:
 
     def update(self, state: State, moved: Bool[Array, " n"]) -> State:
         """Bring f and g of a state up to date after some objects moved."""
-        problem, settings = self.problem, self.problem.config.existence
+        problem, settings, grasps = self.problem, self.problem.config.existence, self.belief.grasps
         objects = state.scene.replace(valid=state.scene.valid & ~state.is_target)
+        if self.belief.exists.shape[-1] == 0:
+            # Only the found pose counts; see `belief.without_candidates`.
+            counts = self.objective.needs_graspability(self.belief, state)[-1]
+            return state.replace(hits=found_hits(problem.target_grasps, grasps, objects, counts, state.hits, moved))
         counts_collisions = state.exists if self.config.predicted_collisions else None
         views = object_views(
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
@@ -129,7 +133,7 @@ class Rollout:
         at_candidate_poses, at_found_pose = split_found(
             self.objective.needs_graspability(self.belief, state.replace(exists=exists))
         )
-        grasps, rows = self.belief.grasps, problem.grasps.pair_pose.shape[0]
+        rows = problem.grasps.pair_pose.shape[0]
         # After the target moved, other rows of H count, which are not computed yet.
         stale = moved | jnp.any(moved & state.is_target)
         hits = grasp_hits(problem.grasps, objects, at_candidate_poses, state.hits[:rows], stale)
@@ -151,9 +155,12 @@ class Rollout:
         """J of a state that is up to date."""
         return self.objective.cost(self.problem, self.belief, state, self.config.weights)
 
-    def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
+    def _proposed(self, state: State, key: Array) -> Sample:
         drawn_in = self.drawn_in(self.present, state)
-        sample = self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, drawn_in)
+        return self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, drawn_in)
+
+    def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
+        sample = self._proposed(state, key)
         return sample, self.predict(self.problem, state, sample, first)
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
@@ -163,7 +170,10 @@ class Rollout:
             return self._attempt(first, state, key)
         draws = jnp.where(first, most, self.config.draws)
         attempt = lambda state, i: self._attempt(first, state, jax.random.fold_in(key, i))  # noqa: E731
-        return (_draw_one_by_one if on_cpu() else _draw_all)(attempt, state, draws, most)
+        if not on_cpu():
+            return _draw_all(attempt, state, draws, most)
+        shapes = jax.eval_shape(self._proposed, state, key)
+        return _draw_one_by_one(attempt, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), state, draws)
 
     def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
         """Sample an action in a state: the predicted changes, the action, and its penalty as a share of J."""
@@ -223,11 +233,9 @@ def _emptied_unless(state: State, counts: Bool[Array, ""]) -> State:
     return state.replace(scene=scene, available=state.available & counts)
 
 
-def _draw_one_by_one(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
-    """The first possible attempt, without computing later ones: fastest on a CPU."""
-    shapes, _ = jax.eval_shape(attempt, state, jnp.int32(0))
+def _draw_one_by_one(attempt: Attempt, blank: Sample, state: State, draws: Int[Array, ""]) -> tuple[Sample, Prediction]:
+    """The first possible attempt, without computing later ones: fastest on a CPU. `blank` is any sample."""
     nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
-    blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
     def again(carry):
         i, (_, prediction) = carry
@@ -238,7 +246,11 @@ def _draw_one_by_one(attempt: Attempt, state: State, draws: Int[Array, ""], most
         i, (_, prediction) = carry
         return (i < draws) & ~prediction.possible & state.alive
 
-    return jax.lax.while_loop(goes_on, again, (jnp.int32(0), blank))[1]
+    # All that changes varies from sequence to sequence from the beginning: JAX would trace the loop once more to find
+    # that it does.
+    begin = (jnp.int32(0), (blank, nothing))
+    varying = jax.tree.map(lambda a: jnp.where(state.alive, a, a), begin)
+    return jax.lax.while_loop(goes_on, again, varying)[1]
 
 
 def _draw_all(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:

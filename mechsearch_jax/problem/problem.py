@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import flax.struct
 import jax
 import numpy as np
@@ -9,7 +11,7 @@ import numpy as np
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import ProblemConfig
-from mechsearch_jax.existence import ExistenceTables, existence_tables
+from mechsearch_jax.existence import ExistenceConfig, ExistenceTables, existence_tables
 from mechsearch_jax.graspability import CandidateGrasps, GraspTables, candidate_grasps, grasp_tables
 from mechsearch_jax.retrieval import TargetGrasps
 from mechsearch_jax.robot.entry import check_outside
@@ -95,13 +97,22 @@ def build_problem(
         grasps = candidate_grasps(shelf, gripper, target, config.grasps)
         if grasps.pair_valid.shape[0] == 0:
             raise InputError(NOWHERE)
-        tables = {
-            "existence": existence_tables(camera, shelf, target, config.existence),
-            "grasps": grasps,
-            "actions": action_tables(gripper, config.grasps.wrists, config.actions),
-            "retrieval": grasp_tables(gripper, target, config.retrieval),
-            "poses": target.candidate_poses(shelf),
-            "cell": np.array(target.cell(shelf)[:2], np.float32),
-        }
+        # The images of the target's poses take as long as the rest, and mostly outside of Python.
+        with ThreadPoolExecutor(1) as pool:
+            existence = pool.submit(_existence_tables, camera, shelf, target, config.existence)
+            tables = {
+                "grasps": grasps,
+                "actions": action_tables(gripper, config.grasps.wrists, config.actions),
+                "retrieval": grasp_tables(gripper, target, config.retrieval),
+                "poses": target.candidate_poses(shelf),
+                "cell": np.array(target.cell(shelf)[:2], np.float32),
+                "existence": existence.result(),
+            }
     tables = jax.tree.map(lambda table: jax.device_put(np.asarray(table)), tables)
     return Problem(**tables, camera=camera, shelf=shelf, gripper=gripper, target=target, config=config)
+
+
+def _existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
+    """`existence_tables` in a thread of its own, to which JAX's default device does not pass on."""
+    with on_host():
+        return existence_tables(camera, shelf, target, config)

@@ -56,15 +56,27 @@ def program(name: str, function: Any, *args: Any) -> Program:
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))
 
 
-def nothing_seen() -> Observation:
-    """An observation of nothing, with the shapes of all others."""
-    shapes = jax.eval_shape(lambda: Observation(empty(SLOTS), jax.numpy.array(False), jax.numpy.zeros(3)).judged())
+def nothing_seen(parts: int | None = None) -> Observation:
+    """An observation of nothing, with the shapes of all others.
+
+    Args:
+      parts: room for parts of each body where bodies have parts, such as `geometry.bodies.PARTS`; None where they have
+        none.
+    """
+    shapes = jax.eval_shape(
+        lambda: Observation(empty(SLOTS, parts), jax.numpy.array(False), jax.numpy.zeros(3)).judged()
+    )
     return jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
 
 
-def decision(problem: Problem, policy: Policy) -> list[Program]:
-    """The programs of the first decision that take long to compile, the longest first."""
-    belief, seen = initial_belief(problem), nothing_seen()
+def decision(problem: Problem, policy: Policy, seen: Observation | None = None) -> list[Program]:
+    """The programs of the first decision that take long to compile, the longest first.
+
+    Args:
+      problem, policy: of the search.
+      seen: an observation with the shapes of all others; `nothing_seen()` if None.
+    """
+    belief, seen = initial_belief(problem), seen or nothing_seen()
     programs = []
     if isinstance(policy, PlanningPolicy):
         programs.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
@@ -76,12 +88,12 @@ def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> li
     return [*decision(problem, policy), *motions(motion)]
 
 
-def retrieval(problem: Problem, policy: Policy) -> list[Program]:
-    """The programs of a decision about a found target that take long to compile, but for the plan."""
+def retrieval(problem: Problem, policy: Policy, seen: Observation | None = None) -> list[Program]:
+    """The programs of a decision about a found target that take long to compile, but for the plan; see `decision`."""
     if not isinstance(policy, PlanningPolicy):
         return []
-    found_pose = initial_belief(problem).found_pose
-    return [program("grasp", policy.grasps, problem.target_grasps, nothing_seen().objects, found_pose)]
+    found_pose, seen = initial_belief(problem).found_pose, seen or nothing_seen()
+    return [program("grasp", policy.grasps, problem.target_grasps, seen.objects, found_pose)]
 
 
 def motions(config: MotionConfig) -> list[Program]:
