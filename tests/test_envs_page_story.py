@@ -128,6 +128,21 @@ def test_since_when_nothing_lowered_j_is_said(costs, since, said):
     assert ending(recording).decisive == (since if since is not None else len(costs) - 1)
 
 
+def test_how_many_decisions_had_nothing_that_promised_anything_is_said():
+    recording = course(59.0, 11.0, 11.0, 11.0)
+    kept = recording.steps[0].sampled
+    nothing = dataclasses.replace(kept, value=np.zeros_like(kept.value))
+    said = "decisions since then no action that was left was expected to lower it, and one was made all the same."
+    for hopeless in ((1, 2), (0, 1), (0,)):
+        steps = [
+            dataclasses.replace(step, sampled=nothing) if i in hopeless else step
+            for i, step in enumerate(recording.steps)
+        ]
+        later = sum(i >= 1 for i in hopeless)
+        done = paragraph(dataclasses.replace(recording, steps=steps), "Done")
+        assert (f"In {later} of the 3 {said}" in done) == (later > 0)
+
+
 def test_steps_that_lowered_j_not_or_hardly_are_grey():
     recording = course(90.0, 50.0, 49.0, 48.5)
     assert [idle(recording, i) for i in range(5)] == [False, True, True, True, False]

@@ -210,6 +210,11 @@ def stalled(recording: Recording) -> int | None:
     return None
 
 
+def promises_nothing(step: RecordedStep) -> bool:
+    """Whether no candidate action of a step that trials left was expected to lower J; False where there was none."""
+    return len(step.sampled) > 0 and float(step.sampled.value.min()) >= -LEAST_GAIN
+
+
 def idle(recording: Recording, i: int) -> bool:
     """Whether a step's action lowered J not, or hardly, or, where J after it was not observed, was not expected to.
 

@@ -21,6 +21,7 @@ from mechsearch_jax.envs.page.facts import (
     moves,
     moves_body,
     number,
+    promises_nothing,
     same_action,
     shifts,
     since_found,
@@ -249,7 +250,7 @@ def did_nothing(recording: Recording, i: int) -> str:
     chosen = [k for k in range(len(step.sampled)) if same_action(step, step.sampled.action, k)][:1]
     promised = [float(step.sampled.value[k]) for k in chosen]
     all_the_same = ""
-    if len(step.sampled) and float(step.sampled.value.min()) >= -LEAST_GAIN:
+    if promises_nothing(step):
         all_the_same = " It was made all the same, as no candidate was expected to lower J."
     elif promised and promised[0] < -LEAST_GAIN:
         all_the_same = f" J was expected to fall by {number(-promised[0])}."

@@ -201,10 +201,20 @@ def _course(recording: Recording) -> list[str]:
         fell = f"J fell from {number(costs[0])} to {least} by step {since + 1}; "
     j, on = "it" if fell else "J", f"{'f' if fell else 'F'}rom action {since + 1} on"
     if hardly:
-        return [f"{fell}{on} {j} hardly fell: at best to {min(rest):.1f}."]
+        return [f"{fell}{on} {j} hardly fell: at best to {min(rest):.1f}.", *_all_the_same(recording, since)]
     level = max(rest) - rest[0] <= facts.LEAST_GAIN
     there = f"at each of steps {since + 1} to {len(costs)}" if level else f"at step {len(costs)}"
-    return [f"{fell}{on} nothing lowered {j} ({number(rest[-1])} {there})."]
+    return [f"{fell}{on} nothing lowered {j} ({number(rest[-1])} {there}).", *_all_the_same(recording, since)]
+
+
+def _all_the_same(recording: Recording, since: int) -> list[str]:
+    """How many decisions from a step on had nothing left that promised anything."""
+    acted = [step for step in recording.steps[since:] if step.action is not None]
+    count = sum(map(facts.promises_nothing, acted))
+    if not count:
+        return []
+    decisions = f"In {count} of the {facts.counted(len(acted), 'decision')} since then"
+    return [f"{decisions} no action that was left was expected to lower it, and one was made all the same."]
 
 
 def _mindless(recording: Recording) -> list[str]:
