@@ -171,6 +171,7 @@ def test_its_pose_is_found_from_its_visible_points(target):
         assert min(apart, target.turn - apart) < 0.05
 
 
+@pytest.mark.slow
 def test_looks_at_a_target_of_pieces_are_computed_in_batches():
     """One after the other and in a batch f is the same, also where a closer look decides."""
     target = coarse_grid(TARGETS["cup"])

@@ -166,8 +166,8 @@ def test_a_found_target_stands_in_trials_as_what_it_is():
     cell, simulation = trials.Cell(MUG, SHELF, Gripper()), SimulatorConfig()
     at, nothing = jnp.array([0.6, 0.1, 0.5]), jax.device_get(empty(TARGET))
     for found in (True, False):
-        world = jax.device_get(trials._world(MUG, SHELF, nothing, at, jnp.array(found)))
-        scene = trials._at_rest(cell, simulation, world, nothing, 1.0, 1.0)
+        world = jax.device_get(trials.trial_world(MUG, SHELF, nothing, at, jnp.array(found)))
+        scene = trials.scene_at_rest(cell, simulation, world, nothing, 1.0, 1.0)
         assert scene is not None
         assert not scene.diverged
         body = scene._bodies[TARGET]
