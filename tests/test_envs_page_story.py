@@ -287,7 +287,7 @@ def test_a_page_opens_where_it_was_decided_and_shows_the_belief_first():
     assert ": 1);\n})();" in lost
     head = lost.partition("<nav")[0]
     assert head.count("<img") == 3
-    assert "What was believed at step 5. Coloured: where the target can be" in words(head)
+    assert "What was believed at the end. Coloured: where the target can be, and what" in words(head)
     assert "added up (less is better)" in words(head)
     found = page(LOST)
     assert "What was believed at step 1, and the action that was chosen." in words(found)

@@ -147,7 +147,7 @@ def _belief(recording: Recording, painter: Painter, end: Ending) -> dict[str, An
     step = recording.steps[end.believing]
     frame = recorded_frame(step, recording.camera, recording.shelf)
     return {
-        "step": end.believing + 1,
+        "when": f"at step {end.believing + 1}" if end.believing < len(recording.steps) - 1 else "at the end",
         "acts": step.action is not None,
         "found": step.found,
         "map": data_uri(painter.believed(step, frame, None, texts.blocked(step))),
