@@ -150,9 +150,3 @@ def _held_up_by(recording: Recording, bodies: Sequence, trace: Trace, action: Ac
     own = int(action.object) if moves(action) else TARGET
     beside = [k for k in range(TARGET + 1) if k != own and any({k, part} in contacts for part in (HAND, ARM))]
     return chain(contacts, beside)
-
-
-def causes_in_words(stops: Sequence[Stop]) -> list[tuple[int, str]]:
-    """How often trials ended how, in words, the most frequent first."""
-    words = [stop.words for stop in stops]
-    return sorted({(words.count(each), each) for each in words}, reverse=True)
