@@ -17,7 +17,6 @@ from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD
 from mechsearch_jax.benchmarks.store import runs
 from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import load_run
@@ -379,15 +378,17 @@ def stored_median(name):
 
 def test_the_times_of_a_decision_are_the_stored_ones():
     readme = " ".join(read("README.md").split())
-    runs = json.loads(read("benchmarks/results/plan-batch-h100.json"))["runs"]
-    (alone,) = [1000 * run["median_seconds"] for run in runs if (run["code"], run["batch"]) == ("after", 1)]
-    file = "benchmarks/results/plan-batch-h100.json"
-    former = f"the default until {THREE_AHEAD.split()[-1]}, which looked three actions ahead,"
-    assert f"A decision of {former} takes [{alone:.0f} ms on one H100]({file})" in readme
+    alone = "plan-one-ahead-h200.json"
+    assert f"A decision takes [{1000 * stored_median(alone):.1f} ms on one H200](benchmarks/results/{alone})" in readme
     # With what is tried out.
-    for file in (ROOT / "benchmarks/results").glob("plan-rehearsal-*.json"):
+    files = list((ROOT / "benchmarks/results").glob("plan-one-ahead-rehearsal-*.json"))
+    assert len(files) == 2
+    for file in files:
         assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme
         assert f"](benchmarks/results/{file.name})" in readme
+    rows = load_run(RESULTS / "runs", "one-ahead-c2-h200").rows
+    batch = 1000 * sum(row.planning_seconds for row in rows) / sum(row.steps for row in rows)
+    assert f"{batch:.0f} ms in [a batch](docs/results.md#speed)" in readme
 
 
 def test_what_images_lose_is_what_is_stored():
