@@ -403,7 +403,7 @@ def test_an_episode_is_replayed_from_its_row(tmp_path, monkeypatch):
     assert films.replay(row, load_scenario(file), tmp_path / "film.png") == ""
     check_evidence(recordings[0].steps[0], row, load_scenario(file))
     assert image.imread(tmp_path / "film.png").std() > 0.05
-    assert "tried out in simulation before acting" in (tmp_path / "film.html").read_text(encoding="utf-8")
+    assert "Trials: simulated before acting" in (tmp_path / "film.html").read_text(encoding="utf-8")
     remark = films.replay(dataclasses.replace(row, steps=7), load_scenario(file), tmp_path / "film.png")
     assert remark.startswith("run again on another machine, perhaps, it ended otherwise: ")
     with pytest.raises(InputError, match="holds something else today"):
