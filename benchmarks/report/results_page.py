@@ -243,7 +243,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),
-        "batch_decision": 1000 * sum(r.planning_seconds for r in batch.rows) / sum(r.steps for r in batch.rows),
+        "batch_decision": 1000 * sum(row.planning_seconds for row in batch.rows) / sum(row.steps for row in batch.rows),
         "at_once": planned["shapes"]["batch"] / planned["median_seconds"],
         "batch_ready": clock["all compiled [s]"],
         "batch_seconds": clock["last episode [s]"] - clock["all compiled [s]"],
