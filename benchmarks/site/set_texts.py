@@ -89,14 +89,14 @@ ABOUT: dict[str, About] = {
     ),
     "report": About(
         "to report with",
-        "Seven sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
+        "Eight sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
         "Each is used once, because scenes that were looked at are no longer unseen; so no picture of them is shown. "
         "Those with rates below are used: `report-a` by the baselines and the robustness [studies](../studies.md), "
         "`report-e` by what the default of 2026-11-26 [comes to](../results.md), then to choose that grasps have to "
         "succeed nearby; `report-f` by what that comes to, and then by grasps that have to succeed with another "
         "friction; `report-g` by what today's default comes to, also where friction, masses and shapes are not known. "
         "Runs up to `trials-before-h200` are of before both.",
-        sets=("report-a", "report-b", "report-c", "report-d", "report-e", "report-f", "report-g"),
+        sets=("report-a", "report-b", "report-c", "report-d", "report-e", "report-f", "report-g", "report-h"),
     ),
     **{
         f"shelf-{name}": About(

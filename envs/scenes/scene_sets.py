@@ -101,7 +101,7 @@ _EXPERIMENTS = (
     *(
         SceneSet(f"report-{letter}", "to report with, once", _blocks(f"report-{letter}", 100, (2, 4, 6, 8), first_seed))
         for letter, first_seed in zip(
-            "abcdefg", (100_000, 110_000, 120_000, 130_000, 190_000, 200_000, 210_000), strict=True
+            "abcdefgh", (100_000, 110_000, 120_000, 130_000, 190_000, 200_000, 210_000, 220_000), strict=True
         )
     ),
     *(
