@@ -25,10 +25,10 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
-SHELF, GRIPPER, CONFIG = Shelf(), Gripper(), ObjectGraspConfig()
+SHELF, GRIPPER = Shelf(), Gripper()
 MAX_YAW, WRISTS = np.pi / 4, 3
-# Objects may be grasped from the side, too.
-WIDE = ObjectGraspConfig(max_yaw=np.pi / 2)
+# From the front alone, and from the side, too.
+CONFIG, WIDE = ObjectGraspConfig(max_yaw=MAX_YAW), ObjectGraspConfig()
 GRASPS = {
     config: jax.jit(lambda prints, config=config: object_grasps(SHELF, GRIPPER, prints, config, MAX_YAW, WRISTS))
     for config in (CONFIG, WIDE)

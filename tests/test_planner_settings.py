@@ -201,7 +201,8 @@ def options_of(tmp_path, text, *arguments):
 
 def test_the_command_line_goes_before_the_file(tmp_path):
     text = '[planner]\npreset = "paper"\ngamma = 0.5\nactions = ["standard"]\n[shelf]\nback = 0.8\n'
-    standard = {name: PRESETS["standard"]().options()[name] for name in ("push_directions", "object_grasp_tilts")}
+    options = PRESETS["standard"]().options()
+    standard = {name: options[name] for name in ("push_directions", "object_grasp_tilts", "object_grasp_max_yaw")}
     given = options_of(tmp_path, text)
     assert given.settings().config == PRESETS["paper"](gamma=0.5, **standard)
     assert given.settings().workcell.shelf.back == 0.8

@@ -44,6 +44,7 @@ def paper(**changes: Any) -> Config:
         "grasp_tilts": tilt,
         "retrieval_tilts": tilt,
         "object_grasp_tilts": tilt,
+        "object_grasp_max_yaw": math.radians(45),
         "push_directions": (math.radians(90), math.radians(-90)),
         "push_distances": (0.05, 0.10, 0.15),
         "actions": ("push", "pick-and-place"),

@@ -58,8 +58,8 @@ class ObjectGraspConfig:
       round_drops: distances of the grasp below a round object's top, used in turn over its approach directions, of
         which there are as many as `boxes` [m].
       tilts: angles by which the gripper points downwards [rad].
-      max_yaw: largest angle between the approach to a flat side and +x [rad]. A box that stands across in front of a
-        side wall can often be grasped from the open side alone.
+      max_yaw: largest angle between the approach to a flat side and +x [rad]. A box that stands across at a wall can
+        often be grasped from its free narrow side alone, with a level hand.
       max_turn: largest angle between the approach and the normal of the grasped side [rad].
       min_turn: smaller angles are treated as square [rad].
       turn_gap: least free part of the opening when the approach is turned [m].
@@ -78,11 +78,11 @@ class ObjectGraspConfig:
     )
     round_drops: tuple[float, ...] = (0.03, 0.04)
     tilts: tuple[float, ...] = option(
-        (math.radians(20), math.radians(30)),
+        (math.radians(10), math.radians(20), math.radians(30)),
         "angles by which the gripper points downwards as it grasps an object [rad]; the paper's is 0.35",
     )
     max_yaw: float = option(
-        math.radians(45),
+        math.radians(90),
         "largest angle between the approach to an object's flat side and straight into the shelf, at most 1.571 [rad]",
     )
     max_turn: float = math.radians(22)
