@@ -51,7 +51,7 @@ def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
     """The rows of an experiment in stored runs.
 
     Of every setting those of the newest run that has it, with its code and the simulator that most of them ran in. A
-    former default is left out where today's has the cell.
+    former default is left out where a later one has the cell.
     """
     rows: dict[Setting, dict[str, Row]] = {}
     for run in runs_of(table, runs):
@@ -69,7 +69,9 @@ def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
 
 
 def _is_outdated(setting: Setting, settings: Collection[Setting]) -> bool:
-    return setting.preset in FORMER_STANDARDS and setting._replace(preset="standard") in settings
+    defaults = ("standard", *FORMER_STANDARDS)
+    later = defaults[: defaults.index(setting.preset)] if setting.preset in defaults else ()
+    return any(setting._replace(preset=preset) in settings for preset in later)
 
 
 def _rows_of(table: PaperTable, run: StoredRun) -> list[tuple[Setting, Row]]:

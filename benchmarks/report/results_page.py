@@ -19,17 +19,21 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, 
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, FROM_THE_FRONT, settings_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.files import PathLike
 
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
-# Of today's default. Fields of the page are named after them.
-RUNS = ("table1-with-friction-h200", "report-g-h200", "collision-free-h200", "report-e-h200")
+# Of today's default, and of the former ones. Fields of the page are named after them.
+RUNS = ("report-h-h200", "table1-with-friction-h200", "report-g-h200", "collision-free-h200", "report-e-h200")
+# Of the default before, beside the first of these in the same run.
+BEFORE = "report-h-before-h200"
 # Whose decisions are timed in a batch.
 BATCH = "one-ahead-c2-h200"
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
@@ -170,13 +174,9 @@ def perception(stored: Stored) -> str:
 
 def _on_new_scenes(run: StoredRun, method: Method) -> list[Row]:
     """The rows with the method's settings on scenes that nothing was chosen on; a later option was as it is usually."""
-    settings, usual = method.options(), Method().options()
+    wanted = settings_of(method.options())
     rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
-    return [
-        row
-        for row in rows
-        if all(options_of(row).get(name, usual.get(name)) == value for name, value in settings.items())
-    ]
+    return [row for row in rows if settings_of(options_of(row)) == wanted]
 
 
 def _named(label: str, rows: Sequence[Row]) -> dict[str, list[Episode]]:
@@ -185,15 +185,15 @@ def _named(label: str, rows: Sequence[Row]) -> dict[str, list[Episode]]:
     return {f"{label}, {seeds} seeds" if seeds > 1 else label: [vars(row) for row in rows]}
 
 
-def _loss(full: Sequence[Row], true: Sequence[Row]) -> dict[str, Any]:
-    """How many points fewer are retrieved from images than with true shapes, in words: `pairs`, `all` with its 95%
+def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
+    """How many points more are retrieved than in the same episodes of other rows, in words: `pairs`, `all` with its 95%
     interval, and `each` by number of objects."""
-    pairs = same_episodes(full, true)
+    pairs = same_episodes(after, before)
     change = change_of(pairs, OUTCOMES["retrieved"])
     assert change.mean is not None
     assert change.interval is not None
     low, high = (100 * bound for bound in change.interval)
-    means = [change_of(same_episodes(full, true, count), OUTCOMES["retrieved"]).mean or 0.0 for count in COUNTS]
+    means = [change_of(same_episodes(after, before, count), OUTCOMES["retrieved"]).mean or 0.0 for count in COUNTS]
     return {
         "pairs": change.pairs,
         "all": f"{100 * change.mean:+.1f} ({low:+.1f} to {high:+.1f})",
@@ -201,13 +201,15 @@ def _loss(full: Sequence[Row], true: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def default_rates(table1: StoredRun, report: StoredRun, collision_free: StoredRun, former: StoredRun) -> dict[str, Any]:
-    """The fields of the template about what the default reaches, with true shapes and from images."""
-    usual = Method()
+def default_rates(
+    today: StoredRun, table1: StoredRun, report: StoredRun, collision_free: StoredRun, former: StoredRun
+) -> dict[str, Any]:
+    """The fields of the template about what the default and the one before reach, with true shapes and from images."""
+    usual = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
     masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
     grasps = dataclasses.replace(masks, config=usual.config.with_options(retrieval_contact=False))
     new, new_full = (_on_new_scenes(report, method) for method in (usual, full))
-    default = {**_named("`c2` 090 to 179", _on_new_scenes(table1, usual)), **_named("`report-g`", new)}
+    default = {**_named("`report-h`", _on_new_scenes(today, Method())), **_named("before: `report-g`", new)}
     free = _named("`masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, grasps))
     seen = _named("`full`, `report-g`", new_full)
     return {
@@ -222,8 +224,8 @@ def default_rates(table1: StoredRun, report: StoredRun, collision_free: StoredRu
                 **seen,
             },
         ),
-        "loss": _loss(new_full, new),
-        "loss_before": _loss(*(_on_new_scenes(former, method) for method in (full, usual))),
+        "loss": _change(new_full, new),
+        "loss_before": _change(*(_on_new_scenes(former, method) for method in (full, usual))),
     }
 
 
@@ -240,6 +242,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
         **default_rates(*runs),
+        "narrow_sides": _change(runs[0].rows, load_run(stored.folder / "runs", BEFORE).rows)["all"],
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
-# The default before it looked one action ahead.
+# The defaults before boxes were grasped from the side, and before that looked one action ahead.
+FROM_THE_FRONT = "standard until 2026-11-28"
 THREE_AHEAD = "standard until 2026-11-26"
-# What preset `standard` was before: by the name that it has since, the options that were other than today's.
+_FRONT_GRASPS = {"object_grasp_max_yaw": math.radians(45), "object_grasp_tilts": (math.radians(20), math.radians(30))}
+# What preset `standard` was before, the latest first: by the name that it has since, the options that were other than
+# today's.
 FORMER_STANDARDS: Mapping[str, Mapping[str, Any]] = {
-    THREE_AHEAD: {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001},
+    FROM_THE_FRONT: _FRONT_GRASPS,
+    THREE_AHEAD: {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001, **_FRONT_GRASPS},
 }
 # Options that no preset decides.
 _NOT_OF_PRESETS = frozenset(("simulator", "target", "seed"))

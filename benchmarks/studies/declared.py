@@ -12,10 +12,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, THREE_AHEAD
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, FROM_THE_FRONT, THREE_AHEAD
 from mechsearch_jax.benchmarks.studies.robustness import IMAGE_SCENES, REPORT_SCENES, ROBUSTNESS
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 from mechsearch_jax.envs.world.mismatch import Mismatch
+from mechsearch_jax.planner import expanded
 
 ABLATION_SCENES = "development"
 # A set for each later question, since a set that was looked at is no longer unseen.
@@ -212,8 +213,8 @@ _CONFIRMATIONS = (
     ),
 )
 
-# Around today's default.
-_DEFAULT = (
+# Around the default that looks one action ahead.
+_ONE_AHEAD_STUDIES = (
     Study(
         "first-actions",
         "How many first actions are worth comparing, and how far ahead, where the eight that are tried differ?",
@@ -263,7 +264,7 @@ def _around(former: str, studies: Sequence[Study]) -> tuple[Study, ...]:
 
     def own(variant: Variant) -> Variant:
         made_of_it = variant.options.get("preset", "standard") in ("standard", "best")
-        return dataclasses.replace(variant, options={**(before if made_of_it else {}), **variant.options})
+        return dataclasses.replace(variant, options={**(before if made_of_it else {}), **expanded(variant.options)})
 
     return tuple(dataclasses.replace(s, variants=tuple(map(own, s.variants)), around=former) for s in studies)
 
@@ -275,7 +276,7 @@ def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
 # By what they are for, in the order of the page.
 GROUPS: Mapping[str, Sequence[Study]] = {
     "Ablations": _around(THREE_AHEAD, _ABLATIONS),
-    "On new scenes": (*_around(THREE_AHEAD, _CONFIRMATIONS), *_DEFAULT),
+    "On new scenes": (*_around(THREE_AHEAD, _CONFIRMATIONS), *_around(FROM_THE_FRONT, _ONE_AHEAD_STUDIES)),
     "Baselines": _around(THREE_AHEAD, _BASELINES),
     "Robustness": _around(THREE_AHEAD, ROBUSTNESS),
 }
