@@ -94,8 +94,8 @@ ABOUT: dict[str, About] = {
         "Those with rates below are used: `report-a` by the baselines and the robustness [studies](../studies.md), "
         "`report-e` by what the default of 2026-11-26 [comes to](../results.md), then to choose that grasps have to "
         "succeed nearby; `report-f` by what that comes to, and then by grasps that have to succeed with another "
-        "friction; `report-g` by what the default until 2026-11-28 comes to, also where friction, masses and shapes are "
-        "not known; "
+        "friction; `report-g` by what the default until 2026-11-28 comes to, also where friction, masses and shapes "
+        "are not known; "
         "`report-h` by what grasps of the narrow sides of boxes gain; its numbers 060 to 099 have not run yet. "
         "Runs up to `trials-before-h200` are of before both.",
         sets=("report-a", "report-b", "report-c", "report-d", "report-e", "report-f", "report-g", "report-h"),
