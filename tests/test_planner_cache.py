@@ -82,3 +82,12 @@ def test_only_a_few_problems_are_kept(folder, problem, monkeypatch):
         monkeypatch.setattr(cache, "_source", lambda version=version: str(version))
         cache.cached_problem()
     assert len(list(folder.glob("problem-*"))) == cache.CACHED_PROBLEMS
+
+
+def test_a_file_that_another_process_deletes_meanwhile_is_no_error(tmp_path):
+    for name in ("first", "second"):
+        (tmp_path / f"problem-{name}.npz").write_bytes(b"")
+    # It is listed, and gone when it is looked at.
+    (tmp_path / "problem-gone.npz").symlink_to(tmp_path / "nowhere")
+    kept_arrays.forget_old(tmp_path, "problem", 1)
+    assert len([file for file in tmp_path.glob("problem-*") if file.exists()]) == 1

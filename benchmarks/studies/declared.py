@@ -153,7 +153,7 @@ _ABLATIONS = (
 _LEFT_OUT = {"reopen": False, "closer_look": 0, "erosion": 0.0, "cell_reach": (0.5,), "move_target": False}
 
 # What may take the default's place: it looks one action ahead, and leaves two extensions out.
-_THREE_AHEAD = {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001}
+_THREE_AHEAD = FORMER_STANDARDS[THREE_AHEAD]
 _ONE_AHEAD = {"horizon": 1, "sequences": 300, "move_target": False, "erosion": 0.0}
 _FULL = {"recognition": "full"}
 

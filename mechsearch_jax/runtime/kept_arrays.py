@@ -76,8 +76,12 @@ def load_arrays(file: Path, key: str) -> dict[str, np.ndarray] | None:
 
 def forget_old(folder: Path, kind: str, most: int) -> None:
     """Delete files of a kind beyond a number, those that were not used for the longest time."""
-    files = sorted(folder.glob(f"{kind}-*.npz"), key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in files[most:]:
+    by_use: list[tuple[float, Path]] = []
+    for file in folder.glob(f"{kind}-*.npz"):
+        # Another process may delete it meanwhile.
+        with contextlib.suppress(OSError):
+            by_use.append((file.stat().st_mtime, file))
+    for _, file in sorted(by_use, reverse=True)[most:]:
         file.unlink(missing_ok=True)
 
 
