@@ -31,9 +31,11 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default, and of the former ones. Fields of the page are named after them.
-RUNS = ("report-h-h200", "table1-with-friction-h200", "report-g-h200", "collision-free-h200", "report-e-h200")
-# Of the default before, beside the first of these in the same run.
-BEFORE = "report-h-before-h200"
+RUNS = ("report-h-whole-h200", "table1-narrow-sides-h200", "report-g-h200", "collision-free-h200")
+# The default and the one before, in one run.
+CHANGED = "report-h-h200", "report-h-before-h200"
+# Of the default on scenes that it was chosen on.
+PUBLISHED = "published-narrow-sides-h200"
 # Whose decisions are timed in a batch.
 BATCH = "one-ahead-c2-h200"
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
@@ -201,17 +203,18 @@ def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def default_rates(
-    today: StoredRun, table1: StoredRun, report: StoredRun, collision_free: StoredRun, former: StoredRun
-) -> dict[str, Any]:
+def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
     """The fields of the template about what the default and the one before reach, with true shapes and from images."""
-    usual = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
-    masks, full = (dataclasses.replace(usual, recognition=name) for name in ("masks", "full"))
-    grasps = dataclasses.replace(masks, config=usual.config.with_options(retrieval_contact=False))
-    new, new_full = (_on_new_scenes(report, method) for method in (usual, full))
-    default = {**_named("`report-h`", _on_new_scenes(today, Method())), **_named("before: `report-g`", new)}
-    free = _named("`masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, grasps))
-    seen = _named("`full`, `report-g`", new_full)
+    masks, full = (Method(recognition=name) for name in ("masks", "full"))
+    front = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
+    front_full = dataclasses.replace(front, recognition="full")
+    front_grasps = dataclasses.replace(
+        front, recognition="masks", config=front.config.with_options(retrieval_contact=False)
+    )
+    new, new_full = (_on_new_scenes(today, method) for method in (Method(), full))
+    default = {**_named("`report-h`", new), **_named("before: `report-g`", _on_new_scenes(before, front))}
+    seen = _named("`full`, `report-h`", new_full)
+    free = _named("before: `masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, front_grasps))
     return {
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps({**default, **seen}),
@@ -225,7 +228,7 @@ def default_rates(
             },
         ),
         "loss": _change(new_full, new),
-        "loss_before": _change(*(_on_new_scenes(former, method) for method in (full, usual))),
+        "loss_before": _change(*(_on_new_scenes(before, method) for method in (front_full, front))),
     }
 
 
@@ -235,6 +238,7 @@ def computed(stored: Stored) -> dict[str, Any]:
     paper = stored.run("published-paper-h200", "search-for-grasp")
     runs = [load_run(stored.folder / "runs", name) for name in RUNS]
     clock = new["clock"]["nothing kept"]
+    published = [vars(row) for row in load_run(stored.folder / "runs", PUBLISHED).rows]
     batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-one-ahead-batch-h200"]
     frictions = {"same": "X1", "half": "X5", "double": "X2"}
     starts = stored["scenes-start-cpu"]["summary"]
@@ -242,7 +246,8 @@ def computed(stored: Stored) -> dict[str, Any]:
         **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
         **default_rates(*runs),
-        "narrow_sides": _change(runs[0].rows, load_run(stored.folder / "runs", BEFORE).rows)["all"],
+        "narrow_sides": _change(*(load_run(stored.folder / "runs", name).rows for name in CHANGED))["all"],
+        "published": with_interval(published, "retrieved"),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),

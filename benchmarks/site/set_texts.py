@@ -96,7 +96,8 @@ ABOUT: dict[str, About] = {
         "succeed nearby; `report-f` by what that comes to, and then by grasps that have to succeed with another "
         "friction; `report-g` by what the default until 2026-11-28 comes to, also where friction, masses and shapes "
         "are not known; "
-        "`report-h` by what grasps of the narrow sides of boxes gain; its numbers 060 to 099 have not run yet. "
+        "`report-h` by what grasps of the narrow sides of boxes gain (000 to 059), and then by what the default with "
+        "them comes to. "
         "Runs up to `trials-before-h200` are of before both.",
         sets=("report-a", "report-b", "report-c", "report-d", "report-e", "report-f", "report-g", "report-h"),
     ),
