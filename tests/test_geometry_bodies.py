@@ -154,6 +154,24 @@ def test_a_body_is_hit_and_seen_as_its_parts_are_one_by_one(seed):
         same(depth(body), depth(alone))
 
 
+@quick
+@given(seeds, st.sampled_from((0.0, 1.0, 1e3)))
+def test_what_absent_parts_hold_does_not_count(seed, value):
+    scene = drawn(seed)
+    there = np.asarray(scene.parts.valid)
+
+    def with_value(field):
+        return np.where(there.reshape(*there.shape, *[1] * (field.ndim - 2)), field, np.float32(value))
+
+    fields = {name: with_value(getattr(scene.parts, name)) for name in ("size", "position", "rotation")}
+    other = scene.replace(parts=scene.parts.replace(**fields))
+    assert not there.all()
+    for answer in (hits, touched, windows, prints):
+        a, b = answer(scene), answer(other)
+        same(*(x.replace(parts=None) if answer is prints else x for x in (a, b)))
+    same(depth(scene), depth(other))
+
+
 def test_a_window_shows_what_the_whole_image_shows_of_a_body():
     scene = drawn(5)
     shown = windows(scene)

@@ -30,8 +30,8 @@ from mechsearch_jax.geometry.transforms import inverse, make, matmul
 BOXES, CLOUDS, GAUGES = 1024, 128, 32
 # Pairs of a cloud and a body of several parts that a CPU tests together.
 BODIES = 512
-# Where absent parts are put, out of reach of any cloud [m].
-NOWHERE = 1e3
+# `_numbers` of what is absent: a sphere out of reach of any cloud.
+ABSENT = np.float32([1, 0, 0, 1e3, 0, 1, 0, 1e3, 0, 0, 1, 1e3, 1e-3, 1e-3, 1e-3, 1, 1])
 # With at most so many pairs, bounds do not pay: gauges decide at once.
 FEW = 1024
 # State of a pair: apart, undecided, or colliding.
@@ -87,10 +87,10 @@ def collisions(
     Returns:
       True where a masked pair collides.
     """
-    parts = world_parts(scene)
+    objects = _numbers(world_parts(scene))
     if scene.parts is not None:
-        parts = parts.replace(position=jnp.where(parts.valid[:, None], parts.position, NOWHERE))
-    objects = _numbers(parts)
+        # On a CPU no mask tells which parts are absent, whose fields may hold anything, a rotation of zeros too.
+        objects = jnp.where(scene.parts.valid.reshape(-1, 1), objects, ABSENT)
     boxes = jnp.stack([clouds.low, clouds.high], axis=1)
     table = (clouds.points, boxes, clouds.gap)
     rows = (jnp.asarray(cloud, jnp.uint32), T_world_cloud, objects, table[:2] if own else None)
