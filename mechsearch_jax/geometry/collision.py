@@ -31,7 +31,7 @@ BOXES, CLOUDS, GAUGES = 1024, 128, 32
 # Pairs of a cloud and a body of several parts that a CPU tests together.
 BODIES = 512
 # `_numbers` of what is absent: a sphere out of reach of any cloud.
-ABSENT = np.float32([1, 0, 0, 1e3, 0, 1, 0, 1e3, 0, 0, 1, 1e3, 1e-3, 1e-3, 1e-3, 1, 1])
+ABSENT = np.array([1, 0, 0, 1e3, 0, 1, 0, 1e3, 0, 0, 1, 1e3, 1e-3, 1e-3, 1e-3, 1, 1], np.float32)
 # With at most so many pairs, bounds do not pay: gauges decide at once.
 FEW = 1024
 # State of a pair: apart, undecided, or colliding.
