@@ -230,7 +230,7 @@ def test_a_mug_hides_the_target_and_is_moved(problem):
     belief, behind = may_be(problem, hides, HIDDEN)
     assert behind
     assert not elsewhere
-    policy = planner.search_for_grasp(sequences=16, horizon=2)
+    policy = planner.search_for_grasp(sequences=16, horizon=1)
     decision = policy(jax.random.key(0), problem, belief, seen(hides))
     assert int(decision.action.kind) != ActionKind.NONE
     assert int(decision.action.object) == 0

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -63,10 +64,13 @@ def test_what_succeeds_in_physics_is_made_until_the_target_is_out(problem):
     settings = RunSettings(options=method.options(), trials=trials)
     episode = run_episode(Start(SCENARIO, 0), problem, method.policy(), NativeSimulator(), settings, decisions)
     check(episode, "NativeSimulator")
-    assert len(trials.tried) == len(decisions.actions) == len(episode.steps)
-    for (actions, results), made in zip(trials.tried, decisions.actions, strict=True):
+    # Where every grasp of the target fails, other actions are tried next.
+    won = [(actions, results) for actions, results in trials.tried if np.any(results == TrialResult.SUCCEEDED)]
+    lost = [actions for actions, results in trials.tried if not np.any(results == TrialResult.SUCCEEDED)]
+    assert all(np.all(np.isin(actions.kind, (ActionKind.NONE, ActionKind.RETRIEVE))) for actions in lost)
+    assert len(won) == len(decisions.actions) == len(episode.steps)
+    for (actions, results), made in zip(won, decisions.actions, strict=True):
         first = int(np.argmax(results == TrialResult.SUCCEEDED))
-        assert results[first] == TrialResult.SUCCEEDED
         np.testing.assert_array_equal(made.kind, actions.kind[first])
         np.testing.assert_array_equal(made.T_world_gripper, actions.T_world_gripper[first])
 
