@@ -98,8 +98,9 @@ class GraspConfig:
             return tuple(map(math.radians, degrees))
 
         return cls(
-            yaws=25,
-            tilts=angles(20.0, 22.5, 25.0, 27.5, 30.0),
+            yaws=41,
+            max_yaw=math.radians(75),
+            tilts=angles(20.0, 25.0, 30.0),
             wrists=angles(-60.0, -30.0, 0.0, 30.0, 60.0),
             antipodal=600,
         )
