@@ -4,7 +4,7 @@ Each segment has a superquadric. Where many of its points do not lie on it, or r
 fitted to parts of the points: to those that lie on no shape yet, and to both sides of the cuts that divide the points
 of the worst part into the most uniform halves. Of all these and of what there was, the union is kept that explains the
 segment's points and the free rays around it best, at a price for each part. That is repeated, and at last every part
-is fitted again to the points that are nearest to it.
+is fitted again to the points that are nearest to it. Bodies that then float are joined to those that they touch.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from mechsearch_jax.perception.confidence import confidence_of
 from mechsearch_jax.perception.explanation import Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.hypotheses import SLOTS
 from mechsearch_jax.perception.parts.divisions import Frame, frame_of, guesses, halves, in_frame
+from mechsearch_jax.perception.parts.joining import join_floating
 from mechsearch_jax.perception.parts.unions import (
     Evidence,
     UnionCosts,
@@ -152,10 +153,22 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
         better = several & (found < cost)
         parts, cost = _where(better, after, parts), jnp.where(better, found, cost)
     misfit = jax.vmap(lambda p, e: union_misfit(table_of(p, e, config), p.valid, e))(parts, evidence)
-    misfit = misfit / jnp.maximum(evidence.pixels, 1.0)
+    parts, owner = join_floating(parts, evidence, jnp.float32(shelf.board))
+    several = jnp.sum(parts.valid, axis=1) > 1
+    of_body = owner[None] == slots[:, None]
+    misfit, pixels = (jnp.sum(jnp.where(of_body, each[None], 0.0), axis=1) for each in (misfit, evidence.pixels))
+    misfit = misfit / jnp.maximum(pixels, 1.0)
     measures = fitted.measures.replace(misfit=jnp.where(several, misfit, fitted.measures.misfit))
     confidence = jnp.where(several, confidence_of(measures), fitted.confidence)
-    return fitted.replace(objects=_bodies(base, parts, frames), measures=measures, confidence=confidence)
+    joined = jnp.sum(of_body & base.valid[None], axis=1) != 1
+    of_object = (fitted.labels >= 0) & (fitted.labels < SLOTS)
+    return fitted.replace(
+        objects=_bodies(base.replace(valid=base.valid & (owner == slots)), parts, frames),
+        measures=measures,
+        confidence=confidence,
+        labels=jnp.where(of_object, owner[jnp.clip(fitted.labels, 0, SLOTS - 1)], fitted.labels),
+        changed=fitted.changed | (joined & base.valid),
+    )
 
 
 def _each(function: Callable[..., Any], config: PartsConfig, active: Bool[Array, " n"], *rows: Any) -> Any:
