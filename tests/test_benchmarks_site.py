@@ -127,7 +127,7 @@ def test_a_set_that_nothing_ran_on_says_so():
 
 
 def test_the_list_names_the_sets_that_nothing_ran_on_yet():
-    used = [{**line(2, 0.9), "scene_set": f"report-{letter}"} for letter in "abcefgh"]
+    used = [{**line(2, 0.9), "scene_set": f"report-{letter}"} for letter in "abcefghi"]
     assert "**To report a change**: of the sets [`report-*`](report.md) one that nothing ran on yet: `report-d`. " in (
         set_pages.index_page(used)
     )
@@ -139,7 +139,7 @@ def test_sets_on_one_page_have_rates_of_their_own():
     lines = [{**line(2, 0.9), "scene_set": "report-b"}]
     text = set_pages.page("report", lines, ROOT / "benchmarks/results")
     first, second, *rest = text.split("## Rates on ")[1:]
-    nothing = [f"`report-{letter}`\n\nNothing that is stored ran on it yet." for letter in "acdefgh"]
+    nothing = [f"`report-{letter}`\n\nNothing that is stored ran on it yet." for letter in "acdefghi"]
     assert [each.strip() for each in (first, *rest)] == nothing
     assert "| `standard` | 10 | 0.50" in second
     assert "mechsearch evaluate report-a --out rows" in text

@@ -21,9 +21,9 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 
 # Those that are not a part of another.
-REPORT = tuple(f"report-{letter}" for letter in "abcdefgh")
+REPORT = tuple(f"report-{letter}" for letter in "abcdefghi")
 SHELVES = ("shelf-low", "shelf-narrow", "shelf-wide")
-HOUSEHOLD = ("household", "household-box")
+HOUSEHOLD = ("household", "household-box", "report-household")
 WHOLE = ("c2", "d1", "d2", "d3", "development", "development-box", *REPORT, *SHELVES, *HOUSEHOLD)
 BLOCKS = [block for name in WHOLE for block in SETS[name].blocks]
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -65,7 +65,7 @@ def test_no_two_experiments_share_a_seed():
 def test_every_scene_is_on_record_and_no_two_are_alike():
     assert {name: len(hashes) for name, hashes in recorded().items()} == {b.name: b.scenes for b in BLOCKS}
     hashes = [content for each in recorded().values() for content in each]
-    assert len(set(hashes)) == len(hashes) == 5690
+    assert len(set(hashes)) == len(hashes) == 6490
     assert all(re.fullmatch("[0-9a-f]{12}", content) for content in hashes)
 
 
@@ -88,6 +88,8 @@ DIGESTS = {
     "report-f": "c322c6892597",
     "report-g": "5c7c6af99ea8",
     "report-h": "b3654d20a6f4",
+    "report-i": "9c972ecf3b92",
+    "report-household": "9793216219a7",
     "shelf-low": "f547905348d9",
     "shelf-narrow": "aaa051492858",
     "shelf-wide": "32c83e4f2af2",

@@ -101,7 +101,9 @@ _EXPERIMENTS = (
     *(
         SceneSet(f"report-{letter}", "to report with, once", _blocks(f"report-{letter}", 100, (2, 4, 6, 8), first_seed))
         for letter, first_seed in zip(
-            "abcdefgh", (100_000, 110_000, 120_000, 130_000, 190_000, 200_000, 210_000, 220_000), strict=True
+            "abcdefghi",
+            (100_000, 110_000, 120_000, 130_000, 190_000, 200_000, 210_000, 220_000, 230_000),
+            strict=True,
         )
     ),
     *(
@@ -115,6 +117,11 @@ _EXPERIMENTS = (
     SceneSet("household", "household things", _blocks("household", 200, (4, 8), 170_000, things="household")),
     SceneSet(
         "household-box", "household things", _blocks("household-box", 50, (4, 8), 180_000, "box", things="household")
+    ),
+    SceneSet(
+        "report-household",
+        "household things, to report with, once",
+        _blocks("report-household", 200, (4, 8), 240_000, things="household"),
     ),
 )
 
