@@ -36,6 +36,7 @@ from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.explanation import Explaining, Fitter, as_segmented
 from mechsearch_jax.perception.parts.in_parts import InParts
+from mechsearch_jax.perception.parts.segments import Connected
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
@@ -275,5 +276,5 @@ def _with_masks(target: Target, several: bool) -> ImageRecogniser:
 @functools.cache
 def _alone(target: Target, detector: TargetColour, several: bool) -> ColourRecogniser:
     segmenter = WeightedSegmenter(shipped_weights("segmentation"))
-    fitter = InParts(Explaining()) if several else Explaining()
+    fitter = InParts(Connected()) if several else Explaining()
     return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"), fitter=fitter)

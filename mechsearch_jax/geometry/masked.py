@@ -211,7 +211,7 @@ def masked_vmap(
         batch, n, total = mask.shape[:-1], mask.shape[-1], mask.size
         per_element, rows = both
         size = block_size(block, total)
-        if total <= size and not on_cpu():
+        if total == 0 or (total <= size and not on_cpu()):
             return _everywhere(function, mask, shared, per_element, rows)
         width = jnp.uint32(n)
 

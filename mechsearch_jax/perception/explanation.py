@@ -53,6 +53,7 @@ class ExplanationConfig(Costs):
     Attributes:
       splits: number of the most doubtful segments that are divided; 0 for none.
       merges: number of pairs of segments that are joined; 0 for none.
+      drops: whether an object is left out that explains less than it costs.
       doubtful: a segment is doubtful if so many of its pixels are badly explained, and ...
       doubtful_share: ... such a share of them.
       touching: two segments are joined if they border on each other and one is doubtful, or if their objects are so
@@ -63,6 +64,7 @@ class ExplanationConfig(Costs):
 
     splits: int = 3
     merges: int = 3
+    drops: bool = True
     doubtful: float = 8.0
     doubtful_share: float = 0.04
     touching: float = 0.005
@@ -239,7 +241,10 @@ def _explain(
     divided = (doubtful[chosen][:, None] & distinct(first, pixels[chosen])).reshape(-1)
     divided &= jnp.min(counts.reshape(-1, 2), axis=1) >= config.part
     # What something hides in the middle shows two segments that do not border on each other, but whose objects overlap.
-    borders, deep = bordering(image, config.jump), jnp.triu(penetrations(base) - config.touching, 1)
+    borders, deep = (
+        bordering(image.points, image.labels, config.jump),
+        jnp.triu(penetrations(base) - config.touching, 1),
+    )
     either = (borders >= 3) & (doubtful[:, None] | doubtful[None])
     likely = jnp.where(either, borders, 0.0) + 1e4 * jnp.maximum(deep, 0.0)
     likely, pair = jax.lax.top_k(likely.reshape(-1), config.merges)
@@ -253,7 +258,9 @@ def _explain(
     fits = fits.replace(valid=fits.valid & ~_inside(fits, body))
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), base, fits, body)
 
-    selection = select_objects(everything, moves_of(chosen, divided, (low, high), joined), sample, pixels, config)
+    selection = select_objects(
+        everything, moves_of(chosen, divided, (low, high), joined, config.drops), sample, pixels, config
+    )
     errors = jnp.concatenate([base_error, error, jnp.zeros(1)])
     return _chosen(everything, errors, selection, image, fitted_target, sample, config)
 
@@ -285,7 +292,8 @@ def _chosen(
     config: ExplanationConfig,
 ) -> Fitted:
     """The selected objects in eight slots, those of segments that stay in theirs, with the labels of their pixels."""
-    stays, new = selection.selected[:SLOTS], selection.selected[SLOTS:-1]
+    # There may be no hypotheses.
+    stays, new = selection.selected[:SLOTS], jnp.pad(selection.selected[SLOTS:-1], (0, SLOTS))
     order = jnp.argsort(~new, stable=True)[:SLOTS]
     free = jnp.cumsum(~stays) - 1
     filled = ~stays & (free < jnp.sum(new))

@@ -25,7 +25,7 @@ _ALIKE = 0.05
 _SPREADS = 12
 
 
-def _connected(points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float) -> Int[Array, "h w"]:
+def connected(points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float) -> Int[Array, "h w"]:
     """A number for each pixel, the same for connected pixels of a segment.
 
     Each round takes the least number of the neighbours, and of the pixel that has the number.
@@ -81,7 +81,7 @@ def parts(
     """First parts of segments in each way of division: the points that are on the fitted object; the largest connected
     piece; the points on one side of a vertical plane."""
     shape = image.labels.shape
-    numbers = _connected(image.points, image.labels, jump).reshape(-1)
+    numbers = connected(image.points, image.labels, jump).reshape(-1)
     flat = jnp.where((image.labels == MISSING).reshape(-1, 1), 0.0, image.points.reshape(-1, 3))
     labels = image.labels.reshape(-1)
 
@@ -111,19 +111,22 @@ def distinct(first: Bool[Array, "k ways h w"], pixels: Int[Array, " k"]) -> Bool
     return ~jnp.any(jnp.tril(alike, -1), axis=-1)
 
 
-def bordering(image: LabelledImage, jump: float) -> Float[Array, "8 8"]:
-    """Number of neighbouring pixels of every two segments whose points are near; each pair once, above the diagonal."""
-    total = jnp.zeros((SLOTS, SLOTS))
+def bordering(
+    points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float, count: int = SLOTS
+) -> Float[Array, "n n"]:
+    """Number of neighbouring pixels of every two of `count` segments whose points are near; each pair once, above the
+    diagonal."""
+    total = jnp.zeros((count, count))
     for axis in (0, 1):
-        apart = jnp.linalg.norm(jnp.diff(image.points, axis=axis), axis=-1)
-        size = image.labels.shape[axis]
+        apart = jnp.linalg.norm(jnp.diff(points, axis=axis), axis=-1)
+        size = labels.shape[axis]
         first, second = (
-            jax.lax.slice_in_dim(image.labels, i, size - 1 + i, axis=axis).reshape(-1).astype(jnp.int32) for i in (0, 1)
+            jax.lax.slice_in_dim(labels, i, size - 1 + i, axis=axis).reshape(-1).astype(jnp.int32) for i in (0, 1)
         )
         close = (apart.reshape(-1) < jump) & (first >= 0) & (second >= 0) & (first != second)
         low, high = jnp.minimum(first, second), jnp.maximum(first, second)
-        pair = jnp.where(close, low * SLOTS + high, 0)
-        total = total + jnp.zeros(SLOTS * SLOTS).at[pair].add(close * 1.0).reshape(SLOTS, SLOTS)
+        pair = jnp.where(close, low * count + high, 0)
+        total = total + jnp.zeros(count * count).at[pair].add(close * 1.0).reshape(count, count)
     return total
 
 

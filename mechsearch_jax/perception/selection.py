@@ -160,6 +160,7 @@ def moves_of(
     divided: Bool[Array, " d"],
     pair: tuple[Array, Array],
     joined: Bool[Array, " m"],
+    drops: bool = True,
 ) -> Moves:
     """Divide a segment into two objects or one of them, join a pair, or drop an object; the target stays.
 
@@ -168,6 +169,7 @@ def moves_of(
       divided: which of the divisions are tried.
       pair: first and second segment of each union.
       joined: which of the unions are tried.
+      drops: whether objects are dropped.
     """
     count = len(divided)
     capacity = SLOTS + 2 * count + len(joined) + 1
@@ -179,7 +181,7 @@ def moves_of(
     return Moves(
         removed=jnp.concatenate([of_segment, of_segment, of_segment, merged[0] | merged[1], each]),
         added=jnp.concatenate([first | second, first, second, union, jnp.zeros_like(each)]),
-        possible=jnp.concatenate([divided, divided, divided, joined, jnp.ones(len(each), bool)]),
+        possible=jnp.concatenate([divided, divided, divided, joined, jnp.full(len(each), drops)]),
     )
 
 
