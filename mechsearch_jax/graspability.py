@@ -13,7 +13,6 @@ found target.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -30,11 +29,11 @@ from mechsearch_jax.compound_grasps import MOST, level_grasps
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
+from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.robot.entry import WaysIn, gripper_enters
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.options import option
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import Compound
 from mechsearch_jax.workspace.shelf import Shelf
@@ -46,64 +45,6 @@ COARSE = 256
 # Number of hits that a pose without a feasible grasp counts for: one more than the eight objects of a scene and its
 # target, for any number of slots.
 INFEASIBLE = 10
-
-
-@dataclasses.dataclass(frozen=True)
-class GraspConfig:
-    """The candidate grasps and how finely they are tested.
-
-    Attributes:
-      yaws: number of approach directions seen from above, for round objects; boxes are grasped square to their faces.
-      max_yaw: largest angle between the approach and +x, seen from above [rad].
-      tilts: angles by which the gripper points downwards [rad].
-      wrists: angles of joint 7 relative to 45 degrees [rad]; each places link 6 differently beside the hand.
-      height: height of the grasp above the target's centre [m]; higher grasps keep the wrist clear of the board.
-      points: points on the swept gripper.
-      target_points: points on the swept target.
-      still_points: points on the gripper at rest, and on the target, for the crossing with a found target.
-      waypoints: number of poses on an approach at which inverse kinematics must succeed.
-      erosion: by how much the target is shrunk for the collision test of its way out [m].
-      antipodal: of a target of several pieces, the number of grasps that are spread over all opposite places of its
-        surface, from any side and angle (`antipodal_grasps`); 0 for the best level ones at `tilts` and `wrists` alone.
-    """
-
-    yaws: int = 7
-    max_yaw: float = math.radians(45)
-    tilts: tuple[float, ...] = option(
-        (math.radians(20), math.radians(25), math.radians(30)),
-        "angles by which the gripper points downwards as it grasps the target [rad]; the paper's is 0.35",
-    )
-    wrists: tuple[float, ...] = (math.radians(-60), 0.0, math.radians(60))
-    height: float = 0.03
-    points: int = 2048
-    target_points: int = 512
-    still_points: tuple[int, int] = (512, 128)
-    waypoints: int = 4
-    erosion: float = 0.001
-    antipodal: int = 0
-
-    def __post_init__(self):
-        if self.yaws < 1 or not self.tilts or not self.wrists:
-            raise InputError("GraspConfig: yaws must be at least 1, and tilts and wrists hold at least one angle")
-        if self.antipodal < 0:
-            raise InputError(f"GraspConfig: antipodal {self.antipodal} must not be negative")
-        if self.waypoints < 2:
-            raise InputError(f"GraspConfig: {self.waypoints} waypoints make no line; use at least 2")
-
-    @classmethod
-    def dense(cls) -> GraspConfig:
-        """Ten times as many grasps as the default, for the single pose of a found target."""
-
-        def angles(*degrees: float) -> tuple[float, ...]:
-            return tuple(map(math.radians, degrees))
-
-        return cls(
-            yaws=41,
-            max_yaw=math.radians(75),
-            tilts=angles(20.0, 25.0, 30.0),
-            wrists=angles(-60.0, -30.0, 0.0, 30.0, 60.0),
-            antipodal=600,
-        )
 
 
 class GraspTables(flax.struct.PyTreeNode):

@@ -17,7 +17,8 @@ from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
-from mechsearch_jax.graspability import GraspConfig, grasp_tables
+from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.graspability import grasp_tables
 from mechsearch_jax.robot.entry import crossing_length
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
@@ -37,7 +38,7 @@ def space():
 
 @pytest.fixture(scope="module")
 def grasps():
-    config = GraspConfig(yaws=3, tilts=(math.radians(30),), wrists=(math.radians(60),), points=512)
+    config = GraspConfig(yaw_step=math.radians(45), tilts=(math.radians(30),), wrists=(math.radians(60),), points=512)
     return grasp_tables(GRIPPER, Target(), config)
 
 

@@ -11,11 +11,14 @@ import pytest
 from mechsearch_jax.benchmarks.reach.reach import bands, reach, save_reach
 from mechsearch_jax.benchmarks.report.console_tables import reach_table
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import GraspConfig, feasible_grasps, grasp_tables
+from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.graspability import feasible_grasps, grasp_tables
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.workspace.target import Target
 
-GRASPS = GraspConfig(yaws=5, tilts=(math.radians(20),), wrists=(0.0,), points=256, target_points=64)
+GRASPS = GraspConfig(
+    yaw_step=math.radians(22.5), tilts=(math.radians(20),), wrists=(0.0,), points=256, target_points=64
+)
 CELL = Workcell(target=Target(grid=(3, 9)))
 
 
@@ -62,4 +65,4 @@ def test_bands_are_means_and_files_hold_every_row(rows, tmp_path):
     stored = json.loads((tmp_path / "reach.json").read_text())
     assert len(stored["rows"]) == len(rows)
     assert stored["bands"] == bands(rows)
-    assert stored["grasps"]["yaws"] == 5
+    assert stored["grasps"]["yaw_step"] == pytest.approx(math.radians(22.5))

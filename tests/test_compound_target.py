@@ -20,7 +20,8 @@ from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import existence_tables
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import GraspConfig, grasp_tables
+from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.graspability import grasp_tables
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.robot.gripper import Gripper, primitives_in_gripper

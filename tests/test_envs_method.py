@@ -11,7 +11,7 @@ from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
-from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
@@ -46,12 +46,12 @@ def test_options_are_flat_and_complete():
 
 def test_what_is_no_option_tells_methods_apart_too():
     problem = dataclasses.replace(
-        METHODS[0].config.problem, existence=ExistenceConfig(found_pixels=80), retrieval=GraspConfig(yaws=5)
+        METHODS[0].config.problem, existence=ExistenceConfig(found_pixels=80), retrieval=GraspConfig(yaw_step=0.5)
     )
     method = Method(config=dataclasses.replace(METHODS[0].config, problem=problem))
     unusual = {name: value for name, value in method.options().items() if "." in name}
     assert unusual.pop("problem.existence.found_pixels") == 80
-    assert unusual.pop("problem.retrieval.yaws") == 5
+    assert unusual.pop("problem.retrieval.yaw_step") == 0.5
     assert set(unusual) == {f"problem.retrieval.{name}" for name in ("wrists", "antipodal")}
     assert Method.of_options(method.options()) == method
 

@@ -16,7 +16,7 @@ from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
 from mechsearch_jax.envs.episode.verdicts import Verdict, free_in_sets, judge, paper_grasps
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.retrieval import best_grasp, can_be_joined, joined, target_grasps
 from mechsearch_jax.workspace.target import Target
 

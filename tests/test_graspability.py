@@ -1,12 +1,14 @@
 """g against a brute-force reference in float64, and the grasps that it is made of."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mechsearch_jax import graspability, planner
 from mechsearch_jax.geometry import superquadric, transforms
-from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.retrieval import best_grasp, target_grasps
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import Gripper
@@ -102,6 +104,22 @@ def test_a_wide_target_is_refused_with_what_would_do():
         graspability.grasp_tables(Gripper(), Target(half_size=(0.05, 0.05, 0.05)), GraspConfig())
     with pytest.raises(InputError, match="waypoints"):
         GraspConfig(waypoints=1)
+    for wrong in ({"max_yaw": 1.7}, {"max_yaw": np.nan}, {"yaw_step": 0.0}, {"tilts": ()}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            GraspConfig(**wrong)
+
+
+def test_directions_are_no_farther_apart_than_their_step():
+    assert [GraspConfig(max_yaw=np.radians(45), yaw_step=np.radians(s)).yaws for s in (15, 22.5, 40, 90)] == [
+        7,
+        5,
+        5,
+        3,
+    ]
+    assert GraspConfig(max_yaw=0.0).yaws == 1
+    # As many within 45 degrees as the sets of grasps of the paper's preset always had.
+    dense = GraspConfig.dense()
+    assert (dense.yaws, dataclasses.replace(dense, max_yaw=np.radians(45)).yaws) == (41, 25)
 
 
 def test_what_the_target_sweeps_is_the_target_and_its_way():

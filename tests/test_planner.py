@@ -19,7 +19,8 @@ from mechsearch_jax.dynamics.learned import LearnedPush
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import masked, superquadric
-from mechsearch_jax.graspability import GraspConfig, pairs
+from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.graspability import pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner import rollout as rollouts
@@ -104,7 +105,9 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "erosion": 0.0,
         "reopen": True,
         "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
-        "retrieval_tilts": pytest.approx(np.radians([20, 22.5, 25, 27.5, 30]).tolist()),
+        "grasp_max_yaw": pytest.approx(np.radians(45)),
+        "retrieval_tilts": pytest.approx(np.radians([20, 25, 30]).tolist()),
+        "retrieval_max_yaw": pytest.approx(np.radians(75)),
         "push_model": "learned",
         "rehearsal": "physics",
         "max_steps": 10,
@@ -112,7 +115,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
     # What is no option.
     assert (ActionConfig().contact_tolerance, ActionConfig().topple) == (0.003, 0.5)
     assert (QuasiStatic().max_penetration, LearnedPush().max_penetration) == (0.006, 0.026)
-    assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 25)
+    assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 41)
     assert (ExistenceConfig().found_pixels, len(ExistenceConfig().places)) == (100, 5)
 
 
@@ -129,6 +132,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
     assert actions.push_directions == (np.pi / 2, -np.pi / 2)
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
+    assert (config.problem.retrieval.yaws, config.problem.retrieval.max_yaw) == (25, np.radians(45))
     assert actions.grasps.tilts == (np.radians(20),)
     assert config.rehearsal == "none"
     # Where the paper is silent.

@@ -21,6 +21,7 @@ from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, 
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
+from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper
@@ -320,7 +321,7 @@ def test_float32_is_close(shape, half):
 def test_every_shape_has_a_target_that_the_gripper_takes(name):
     target = Target.of(name)
     assert target.yaws == 1 or not shape_of(name).round
-    T = graspability._target_grasps(target, Gripper(), graspability.GraspConfig()).T_target_gripper
+    T = graspability._target_grasps(target, Gripper(), GraspConfig()).T_target_gripper
     assert len(T) > 0
     assert Target() == Target.cylinder() == Target.of("cylinder")
     assert Target.box() == Target.of("box")
@@ -396,7 +397,7 @@ def test_a_new_shape_is_simulated(ball):
 
 def test_a_new_shape_is_searched_for(ball):
     target, shelf = Target.of("ball"), Shelf()
-    T = graspability._target_grasps(target, Gripper(), graspability.GraspConfig()).T_target_gripper
+    T = graspability._target_grasps(target, Gripper(), GraspConfig()).T_target_gripper
     assert len(T) == 7 * 3 * 3
     swept = graspability.swept_target(target, np.array([-1.0, 0.0, 0.0]), 0.3, 500, 0.0)
     assert np.linalg.norm(swept[:, 1:], axis=1).max() <= 0.025 + 1e-6

@@ -15,7 +15,8 @@ from test_workspace_target import BOTTLE, CUP, TEE
 from mechsearch_jax.candidate_pairs import filled_up, pair_tables, thinned
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import GraspConfig, feasible_grasps, grasp_tables
+from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.graspability import feasible_grasps, grasp_tables
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.identity import Uncompared, identity
@@ -122,7 +123,7 @@ def test_tables_of_pairs_have_the_shape_that_they_have_room_for():
 
 
 def test_rows_without_a_grasp_are_feasible_nowhere():
-    config = GraspConfig(yaws=3)
+    config = GraspConfig(yaw_step=np.pi / 4)
     tables = grasp_tables(Gripper(), HOOK, config)
     poses = np.array([[0.55, 0.1, yaw] for yaw in np.arange(8) * math.pi / 4], np.float32)
     T = upright_pose(jnp.asarray(poses), HOOK.height(SHELF))

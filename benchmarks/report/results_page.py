@@ -19,7 +19,7 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, 
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, FROM_THE_FRONT, settings_of
+from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, FROM_THE_FRONT, WITHIN_45, settings_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.episode.method import Method
@@ -205,13 +205,14 @@ def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
 
 def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
     """The fields of the template about what the default and the one before reach, with true shapes and from images."""
-    masks, full = (Method(recognition=name) for name in ("masks", "full"))
+    of_runs = Method(config=PRESETS["standard"](**FORMER_STANDARDS[WITHIN_45]))
+    masks, full = (dataclasses.replace(of_runs, recognition=name) for name in ("masks", "full"))
     front = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
     front_full = dataclasses.replace(front, recognition="full")
     front_grasps = dataclasses.replace(
         front, recognition="masks", config=front.config.with_options(retrieval_contact=False)
     )
-    new, new_full = (_on_new_scenes(today, method) for method in (Method(), full))
+    new, new_full = (_on_new_scenes(today, method) for method in (of_runs, full))
     default = {**_named("`report-h`", new), **_named("before: `report-g`", _on_new_scenes(before, front))}
     seen = _named("`full`, `report-h`", new_full)
     free = _named("before: `masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, front_grasps))

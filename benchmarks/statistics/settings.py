@@ -10,13 +10,24 @@ from typing import Any, NamedTuple
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
-# The defaults before boxes were grasped from the side, and before that looked one action ahead.
+# The defaults before a found target was grasped from within 75 degrees, before boxes were grasped from the side, and
+# before that looked one action ahead.
+WITHIN_45 = "standard with retrievals within 45°"
 FROM_THE_FRONT = "standard until 2026-11-28"
 THREE_AHEAD = "standard until 2026-11-26"
-_FRONT_GRASPS = {"object_grasp_max_yaw": math.radians(45), "object_grasp_tilts": (math.radians(20), math.radians(30))}
+_RETRIEVALS_WITHIN_45 = {
+    "retrieval_max_yaw": math.radians(45),
+    "retrieval_tilts": tuple(map(math.radians, (20.0, 22.5, 25.0, 27.5, 30.0))),
+}
+_FRONT_GRASPS = {
+    "object_grasp_max_yaw": math.radians(45),
+    "object_grasp_tilts": (math.radians(20), math.radians(30)),
+    **_RETRIEVALS_WITHIN_45,
+}
 # What preset `standard` was before, the latest first: by the name that it has since, the options that were other than
 # today's.
 FORMER_STANDARDS: Mapping[str, Mapping[str, Any]] = {
+    WITHIN_45: _RETRIEVALS_WITHIN_45,
     FROM_THE_FRONT: _FRONT_GRASPS,
     THREE_AHEAD: {"horizon": 3, "sequences": 30, "move_target": True, "erosion": 0.001, **_FRONT_GRASPS},
 }

@@ -43,6 +43,7 @@ def paper(**changes: Any) -> Config:
         "predicted_collisions": True,
         "grasp_tilts": tilt,
         "retrieval_tilts": tilt,
+        "retrieval_max_yaw": math.radians(45),
         "object_grasp_tilts": tilt,
         "object_grasp_max_yaw": math.radians(45),
         "push_directions": (math.radians(90), math.radians(-90)),
