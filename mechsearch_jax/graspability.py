@@ -54,6 +54,7 @@ class GraspTables(flax.struct.PyTreeNode):
       T_target_gripper: pose of the gripper where it closes, shape (G, 4, 4).
       q7: angle of joint 7 in each grasp [rad], shape (G,).
       wrist: index of the wrist's swept gripper cloud, shape (G,).
+      ahead: least cosine of the angle between the approach and +x, seen from above, shape (G,).
       clouds: points that gripper and target sweep in each grasp, in the gripper's frame, shape (G, 3, P).
       low, high: bounding box of each cloud, shape (G, 3) [m].
       still_gripper: points on the open gripper with each wrist, in its own frame, shape (W, 3, S).
@@ -64,6 +65,7 @@ class GraspTables(flax.struct.PyTreeNode):
     T_target_gripper: jax.Array
     q7: jax.Array
     wrist: jax.Array
+    ahead: jax.Array
     clouds: jax.Array
     low: jax.Array
     high: jax.Array
@@ -161,12 +163,12 @@ def feasible_grasps(
 ) -> Bool[Array, "n g"]:
     """Which grasps arm and shelf allow at target poses, regardless of the objects.
 
-    The approach must be within `max_yaw` of +x, the whole way in from outside the shelf reachable, and neither the arm
-    nor the swept cloud may touch the shelf. If `active` is false, no grasp is feasible and little is computed.
+    The approach must be within the grasp's limit of +x, the whole way in from outside the shelf reachable, and neither
+    the arm nor the swept cloud may touch the shelf. If `active` is false, no grasp is feasible and little is computed.
     """
     n, g = T_world_target.shape[0], tables.q7.shape[0]
     T = compose(T_world_target[:, None], tables.T_target_gripper[None])
-    ahead = T[..., 0, 2] >= jnp.cos(config.max_yaw + 1e-4) * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
+    ahead = T[..., 0, 2] >= tables.ahead[None] * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
     ahead &= active
 
     ways = WaysIn(T.reshape(-1, 4, 4), jnp.tile(tables.q7, n), np.tile(np.arange(g), n))
@@ -210,6 +212,8 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
         "T_target_gripper": T_target_gripper,
         "q7": np.asarray(angles, np.float32)[wrist],
         "wrist": np.int32(wrist),
+        # Approaches at the limit count.
+        "ahead": np.full(len(wrist), math.cos(config.max_yaw + 1e-4), np.float32),
         "clouds": np.float32(np.stack(clouds)),
         "low": np.float32(np.stack(low)),
         "high": np.float32(np.stack(high)),

@@ -127,7 +127,7 @@ def can_be_joined(sets: Sequence[TargetGrasps]) -> bool:
     def tested(one: TargetGrasps) -> tuple[Any, ...]:
         tables, config = one.tables, one.config
         shapes = tables.clouds.shape[1:], tables.still_gripper.shape[1:], tables.still_target.shape
-        return config.waypoints, config.max_yaw, shapes
+        return config.waypoints, shapes
 
     return len({tested(one) for one in sets}) == 1
 
@@ -139,13 +139,13 @@ def joined(sets: Sequence[TargetGrasps]) -> TargetGrasps:
       ValueError: they cannot be joined.
     """
     if not can_be_joined(sets):
-        raise ValueError("joined: the sets differ in waypoints, max_yaw or the numbers of points")
+        raise ValueError("joined: the sets differ in waypoints or the numbers of points")
     first, tables = sets[0], [one.tables for one in sets]
     # Each set has its own wrists.
     before = np.cumsum([0, *(len(table.still_gripper) for table in tables)])
     fields: dict[str, Any] = {
         name: jnp.concatenate([getattr(table, name) for table in tables])
-        for name in ("T_target_gripper", "q7", "clouds", "low", "high", "still_gripper")
+        for name in ("T_target_gripper", "q7", "ahead", "clouds", "low", "high", "still_gripper")
     }
     wrist = jnp.concatenate([table.wrist + np.int32(start) for table, start in zip(tables, before, strict=False)])
     gap = jnp.max(jnp.stack([jnp.asarray(table.gap) for table in tables]))

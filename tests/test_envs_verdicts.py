@@ -16,8 +16,9 @@ from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
 from mechsearch_jax.envs.episode.verdicts import Verdict, free_in_sets, judge, paper_grasps
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
+from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.retrieval import best_grasp, can_be_joined, joined, target_grasps
+from mechsearch_jax.retrieval import best_grasp, can_be_joined, found_grasps, joined, target_grasps
 from mechsearch_jax.workspace.target import Target
 
 
@@ -74,6 +75,25 @@ def test_sets_of_grasps_are_judged_together_as_each_alone(problem, changes):
         alone = [bool(best_grasp(grasps, objects, pose).success) for grasps in (own, papers)]
         assert [bool(free) for free in free_in_sets((own, papers), objects, pose)] == alone
     assert not any(free_in_sets((own, papers), objects, pose, jnp.array(False)))
+
+
+def test_each_set_keeps_how_far_to_the_side_its_grasps_may_come_from(problem):
+    """At places beside a wall only the set that comes from farther has a grasp, joined with the other or alone."""
+    narrow, wide = (
+        target_grasps(problem.shelf, problem.gripper, Target.of("box"), GraspConfig(max_yaw=math.radians(degrees)))
+        for degrees in (45, 75)
+    )
+    both = joined((narrow, wide))
+    count = len(narrow.tables.q7)
+    found = 0
+    for yaw in np.radians([0.0, 30.0, 55.0]):
+        T_world_target = upright_pose(jnp.array([0.52, 0.3, yaw]), narrow.target.height(problem.shelf))
+        each = [np.asarray(found_grasps(grasps, T_world_target).feasible) for grasps in (narrow, wide)]
+        np.testing.assert_array_equal(np.asarray(found_grasps(both, T_world_target).feasible), np.concatenate(each))
+        assert (each[0] <= each[1]).all()
+        found += int(each[1].sum()) - int(each[0].sum())
+    assert len(both.tables.q7) == 2 * count
+    assert found > 0
 
 
 def test_sets_that_are_tested_otherwise_are_not_joined(problem):

@@ -120,7 +120,7 @@ _EXPERIMENTS = (
     ),
     SceneSet(
         "report-household",
-        "household things, to report with, once",
+        "to report with, once",
         _blocks("report-household", 200, (4, 8), 240_000, things="household"),
     ),
 )
