@@ -17,7 +17,7 @@ from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT
+from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45
 from mechsearch_jax.benchmarks.store import runs
 from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import load_run
@@ -321,7 +321,7 @@ def unseen_line(run, objects, preset="standard", **settings):
 
 
 def test_the_rates_of_the_readme_are_the_stored_ones():
-    run = load_run(RESULTS / "runs", "report-h-whole-h200")
+    run = load_run(RESULTS / "runs", "report-i-h200")
     header = " | ".join(f"{seen}: found | graspable | retrieved" for seen in ("true shapes", "`full`"))
     stated = {row[0]: row[1:] for row in rows("README.md", f"| objects | {header} |")}
     assert list(stated) == ["2", "4", "6", "8"]
@@ -359,14 +359,15 @@ def test_what_comes_of_images_stands_beside_the_papers_figures():
         ours = [f"{new['found']['rate']:.2f}", graspable, f"{new['retrieved']['rate']:.2f}"]
         assert stated[str(line["objects"])] == [*ours, *paper]
         # Of every cell all of ours are above the paper's, on all scenes of the set, too.
-        for shares in (line, new, unseen_line(any_grasp, line["objects"], recognition="masks")):
+        for shares in (line, new, unseen_line(any_grasp, line["objects"], WITHIN_45, recognition="masks")):
             assert shares["found"]["rate"] > figures.find
             assert shares["retrieved"]["rate"] > figures.grasp
         assert min(line["graspable"]["rate"], new["graspable"]["rate"]) > figures.grasp
     *first, last = (
-        f"{unseen_line(any_grasp, count, recognition='masks')['retrieved']['rate']:.2f}" for count in (2, 4, 6, 8)
+        f"{unseen_line(any_grasp, count, WITHIN_45, recognition='masks')['retrieved']['rate']:.2f}"
+        for count in (2, 4, 6, 8)
     )
-    retrieved = f"{', '.join(first)} and {last} are retrieved by today's."
+    retrieved = f"{', '.join(first)} and {last} are retrieved by the default before the latter."
     assert f"With grasps that may brush something, as by default, and 1 seed {retrieved}" in read("README.md")
 
 
@@ -390,7 +391,7 @@ def test_the_times_of_a_decision_are_the_stored_ones():
     assert f"{batch:.0f} ms in [a batch](docs/results.md#speed)" in readme
 
 
-def test_what_grasps_of_narrow_sides_gain_is_what_is_stored():
+def test_what_grasps_from_the_side_gain_is_what_is_stored():
     today, before = (load_run(RESULTS / "runs", name).rows for name in ("report-h-h200", "report-h-before-h200"))
     change = change_of(same_episodes(today, before), OUTCOMES["retrieved"])
     assert change.pairs == len(today) == len(before) == 480
@@ -404,21 +405,49 @@ def test_what_grasps_of_narrow_sides_gain_is_what_is_stored():
     assert change.pairs == 720
     least, most = (100 * bound for bound in change.interval)
     gain += f" and {100 * change.mean:+.1f} on `c2` ({least:+.1f} to {most:+.1f})"
+    after, before = (load_run(RESULTS / "runs", f"report-i-{name}").rows for name in ("h200", "before-h200"))
+    change = change_of(
+        same_episodes([row for row in after if row.recognition == "oracle"], before), OUTCOMES["retrieved"]
+    )
+    assert change.pairs == len(before) == 799
+    least, most = (100 * bound for bound in change.interval)
+    log = "docs/experiments.md#a-found-target-from-farther-to-the-side"
+    gain += f", and a found target from farther to the side: [{100 * change.mean:+.1f} points]({log}) on `report-i`"
+    gain += f" ({least:+.1f} to {most:+.1f})"
     assert gain in " ".join(read("README.md").split())
 
 
 def test_what_images_lose_is_what_is_stored():
     readme = " ".join(read("README.md").split())
-    rows = load_run(RESULTS / "runs", "report-h-whole-h200").rows
+    rows = load_run(RESULTS / "runs", "report-i-h200").rows
     full, true = ([row for row in rows if row.recognition == seen] for seen in ("full", "oracle"))
     assert len(same_episodes(full, true)) == len(full) == len(true) == 800
     change, *by_count = (change_of(same_episodes(full, true, n), OUTCOMES["retrieved"]) for n in (None, 2, 4, 6, 8))
     least, most = (100 * bound for bound in change.interval)
     assert (
-        f"On `report-h`, `full` retrieves [{100 * change.mean:+.1f} points](docs/results.md#from-images) against true "
+        f"On `report-i`, `full` retrieves [{100 * change.mean:+.1f} points](docs/results.md#from-images) against true "
         f"shapes ({least:+.1f} to {most:+.1f}), with 2, 4, 6 and 8 objects "
         f"{', '.join(f'{100 * each.mean:+.1f}' for each in by_count[:3])} and {100 * by_count[3].mean:+.1f}."
     ) in readme
+
+
+def test_what_household_things_cost_is_what_is_stored():
+    runs = (load_run(RESULTS / "runs", name).rows for name in ("report-household-h200", "report-i-h200"))
+    things, usual = ([row for row in rows if row.objects in (4, 8)] for rows in runs)
+    assert len(things) == len(usual) == 800
+
+    def lost(seen, beside, counts=(4, 8)):
+        shares = [
+            statistics.mean(row.retrieved for row in rows if row.recognition == name and row.objects in counts)
+            for rows, name in ((usual, beside), (things, seen))
+        ]
+        return 100 * (shares[0] - shares[1])
+
+    assert (
+        "Among [household things](docs/experiments.md#household-things-from-images) "
+        f"{lost('oracle', 'oracle'):.1f} points fewer are retrieved with true shapes, {lost('full-parts', 'full'):.1f} "
+        f"from images, with 8 objects {lost('full-parts', 'full', (8,)):.1f}."
+    ) in read("README.md")
 
 
 def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
@@ -436,8 +465,8 @@ def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
     )
     log = "docs/experiments.md#todays-default-on-all-that-is-measured"
     assert (
-        f"Where friction and mass of each body are half to twice what is assumed, [{friction} points fewer]({log}) "
-        f"are retrieved; where shapes are up to 5% off, {sizes}; with both, {both}."
+        f"Where friction and mass of each body are half to twice what is assumed, the default before retrieves "
+        f"[{friction} points fewer]({log}); where shapes are up to 5% off, {sizes}; with both, {both}."
     ) in readme
 
 

@@ -31,9 +31,9 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default, and of the former ones. Fields of the page are named after them.
-RUNS = ("report-h-whole-h200", "table1-narrow-sides-h200", "report-g-h200", "collision-free-h200")
-# The default and the one before, in one run.
-CHANGED = "report-h-h200", "report-h-before-h200"
+RUNS = ("report-i-h200", "table1-narrow-sides-h200", "report-h-whole-h200", "collision-free-h200")
+# The default before, in the run of today's first one.
+CHANGED = "report-i-before-h200"
 # Of the default on scenes that it was chosen on.
 PUBLISHED = "published-narrow-sides-h200"
 # Whose decisions are timed in a batch.
@@ -205,31 +205,33 @@ def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
 
 def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
     """The fields of the template about what the default and the one before reach, with true shapes and from images."""
-    of_runs = Method(config=PRESETS["standard"](**FORMER_STANDARDS[WITHIN_45]))
-    masks, full = (dataclasses.replace(of_runs, recognition=name) for name in ("masks", "full"))
+    former = Method(config=PRESETS["standard"](**FORMER_STANDARDS[WITHIN_45]))
+    former_masks, former_full = (dataclasses.replace(former, recognition=name) for name in ("masks", "full"))
     front = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
-    front_full = dataclasses.replace(front, recognition="full")
     front_grasps = dataclasses.replace(
         front, recognition="masks", config=front.config.with_options(retrieval_contact=False)
     )
-    new, new_full = (_on_new_scenes(today, method) for method in (of_runs, full))
-    default = {**_named("`report-h`", new), **_named("before: `report-g`", _on_new_scenes(before, front))}
-    seen = _named("`full`, `report-h`", new_full)
-    free = _named("before: `masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, front_grasps))
+    new, new_full = (_on_new_scenes(today, Method(recognition=name)) for name in ("oracle", "full"))
+    old, old_full = (_on_new_scenes(before, method) for method in (former, former_full))
+    default = {**_named("`report-i`", new), **_named("before: `report-h`", old)}
+    seen = _named("`full`, `report-i`", new_full)
+    free = _named(
+        "until 2026-11-28: `masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, front_grasps)
+    )
     return {
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps({**default, **seen}),
         "image_rates": rates(
             "recognition",
             {
-                **_named("`masks`, `c2`", _on_new_scenes(table1, masks)),
+                **_named("before: `masks`, `c2`", _on_new_scenes(table1, former_masks)),
                 **free,
-                **_named("`full`, `c2`", _on_new_scenes(table1, full)),
+                **_named("before: `full`, `c2`", _on_new_scenes(table1, former_full)),
                 **seen,
             },
         ),
         "loss": _change(new_full, new),
-        "loss_before": _change(*(_on_new_scenes(before, method) for method in (front_full, front))),
+        "loss_before": _change(old_full, old),
     }
 
 
@@ -238,6 +240,7 @@ def computed(stored: Stored) -> dict[str, Any]:
     new = stored.run("standard-h100", "c2")
     paper = stored.run("published-paper-h200", "search-for-grasp")
     runs = [load_run(stored.folder / "runs", name) for name in RUNS]
+    true = _on_new_scenes(runs[0], Method())
     clock = new["clock"]["nothing kept"]
     published = [vars(row) for row in load_run(stored.folder / "runs", PUBLISHED).rows]
     batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-one-ahead-batch-h200"]
@@ -247,7 +250,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
         **default_rates(*runs),
-        "narrow_sides": _change(*(load_run(stored.folder / "runs", name).rows for name in CHANGED))["all"],
+        "farther_sides": _change(true, load_run(stored.folder / "runs", CHANGED).rows)["all"],
         "published": with_interval(published, "retrieved"),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
