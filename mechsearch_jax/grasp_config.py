@@ -8,13 +8,17 @@ import math
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 
+# From farther to the side the hand would come from behind [rad]; a little more, for a rounded right angle.
+LARGEST_YAW = math.pi / 2 + 1e-3
+
 
 @dataclasses.dataclass(frozen=True)
 class GraspConfig:
     """The candidate grasps and how finely they are tested.
 
     Attributes:
-      max_yaw: largest angle between the approach and +x, seen from above [rad].
+      max_yaw: largest angle between the approach and +x, seen from above [rad]; that of the grasps at candidate poses
+        also limits grasps of round objects, and how a hand puts things down.
       yaw_step: largest angle between neighbouring approach directions to round objects [rad]; boxes are grasped square
         to their faces.
       tilts: angles by which the gripper points downwards [rad].
@@ -50,8 +54,8 @@ class GraspConfig:
     def __post_init__(self):
         if not self.tilts or not self.wrists:
             raise InputError("GraspConfig: tilts and wrists must hold at least one angle each")
-        if not 0 <= self.max_yaw <= math.pi / 2:
-            raise InputError(f"GraspConfig: max_yaw {self.max_yaw} must be between 0 and {math.pi / 2:.3f} rad")
+        if not 0 <= self.max_yaw <= LARGEST_YAW:
+            raise InputError(f"GraspConfig: max_yaw {self.max_yaw} must be from 0 to {LARGEST_YAW:.4f} rad")
         if not self.yaw_step > 0:
             raise InputError(f"GraspConfig: yaw_step {self.yaw_step} must be above 0")
         if self.antipodal < 0:
@@ -66,7 +70,7 @@ class GraspConfig:
 
     @classmethod
     def dense(cls) -> GraspConfig:
-        """Ten times as many grasps as the default, for the single pose of a found target."""
+        """More grasps than the default, of a cylinder ten times as many, for the single pose of a found target."""
 
         def angles(*degrees: float) -> tuple[float, ...]:
             return tuple(map(math.radians, degrees))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import pickle
 
 import pytest
@@ -12,7 +13,7 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.planner import OPTIONS, PRESETS, standard
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
@@ -42,6 +43,13 @@ def test_options_are_flat_and_complete():
     assert json.loads(json.dumps(options)) == options
     assert not any("." in name for name in options)
     assert set(Method().options()) == {"policy", "recognition", "protocol", *(option.name for option in OPTIONS)}
+
+
+def test_episodes_from_before_an_option_run_as_they_did():
+    former = standard(retrieval_tilts=(0.3, 0.4), retrieval_max_yaw=math.radians(45))
+    options = Method(config=former).options()
+    del options["retrieval_max_yaw"]
+    assert Method.of_options(options).config == former
 
 
 def test_what_is_no_option_tells_methods_apart_too():

@@ -104,6 +104,7 @@ def test_a_wide_target_is_refused_with_what_would_do():
         graspability.grasp_tables(Gripper(), Target(half_size=(0.05, 0.05, 0.05)), GraspConfig())
     with pytest.raises(InputError, match="waypoints"):
         GraspConfig(waypoints=1)
+    assert GraspConfig(max_yaw=1.571).max_yaw == 1.571
     for wrong in ({"max_yaw": 1.7}, {"max_yaw": np.nan}, {"yaw_step": 0.0}, {"tilts": ()}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             GraspConfig(**wrong)

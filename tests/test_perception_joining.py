@@ -106,7 +106,7 @@ def test_eager_compiled_and_batched_agree(places):
     batched = jax.vmap(join_floating, in_axes=(0, 0, None))(*jax.tree.map(lambda a: a[None], arguments), BOARD)
     for other in (compiled, jax.tree.map(lambda a: a[0], batched)):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), eager, other)
-    # Nothing that touches another one floats any more, unless the two are one.
+    # What is joined stays so.
     parts, owner = jax.device_get(eager)
     assert all(owner[owner[i]] == owner[i] for i in range(len(places)))
     assert [bool(parts.valid[i].any()) for i in range(len(places))] == [owner[i] == i for i in range(len(places))]

@@ -1,5 +1,6 @@
 """Segments that one superquadric does not explain become bodies of several; all others stay as they are."""
 
+import dataclasses
 import itertools
 
 import hypothesis.extra.numpy as arrays
@@ -20,6 +21,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception.explanation import as_segmented
 from mechsearch_jax.perception.parts.divisions import BOX, CYLINDER, ELLIPSOID, best_cut
 from mechsearch_jax.perception.parts.in_parts import InParts, PartsConfig, depth_noise, in_parts
+from mechsearch_jax.perception.parts.segments import Connected
 from mechsearch_jax.perception.parts.unions import (
     Evidence,
     Table,
@@ -124,10 +126,34 @@ def test_a_scene_of_boxes_and_cylinders_is_the_same_with_and_without_parts():
     assert not only.position.any()
 
 
+def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
+    """A bottle whose neck is a segment of its own: with `joins` both are one body, else each stays in its slot."""
+    image, view, _ = seen(thing("wine-bottle", 0.55, -0.05))
+    high = (image.labels == 0) & (image.points[..., 2] > SHELF.board + 0.2)
+    assert 20 < int(jnp.sum(high)) < int(jnp.sum(image.labels == 0))
+    divided = image.replace(labels=jnp.where(high, 1, image.labels).astype(image.labels.dtype))
+    keys = jax.random.split(jax.random.key(2))
+    base = as_segmented(keys, divided, ShapeNetwork.of(), view.camera, SHELF, TARGET, RefinementConfig())
+    assert np.asarray(base.objects.valid)[:2].all()
+    config = PartsConfig(rounds=1, refits=1, points=128, rays=128)
+    apart, joined = (
+        in_parts(divided, base, view.camera, SHELF, dataclasses.replace(config, joins=joins)) for joins in (False, True)
+    )
+    assert np.asarray(apart.objects.valid)[:2].tolist() == [True, True]
+    np.testing.assert_array_equal(apart.labels, divided.labels)
+    assert np.asarray(joined.objects.valid)[:2].tolist() == [True, False]
+    assert joined.labels.dtype == divided.labels.dtype
+    np.testing.assert_array_equal(joined.labels == 0, divided.labels >= 0)
+    assert np.asarray(joined.changed)[0]
+    assert np.asarray(joined.confidence)[1] == 0.0
+    assert np.sum(np.asarray(joined.objects.parts.valid)[0]) >= 2
+
+
 def test_parts_are_off_unless_they_are_named():
     assert recogniser("masks", TARGET).fitter is as_segmented
-    assert isinstance(recogniser("masks-parts", TARGET).fitter, InParts)
-    assert isinstance(recogniser("full-parts", TARGET).fitter, InParts)
+    # A mask's segments are kept.
+    assert recogniser("masks-parts", TARGET).fitter == InParts(as_segmented, PartsConfig(joins=False))
+    assert recogniser("full-parts", TARGET).fitter == InParts(Connected(), PartsConfig(joins=True))
     assert not isinstance(recogniser("full", TARGET).fitter, InParts)
 
 

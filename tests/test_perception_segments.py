@@ -14,7 +14,8 @@ from mechsearch_jax.envs.scenes.scene_sets import find_scene, make_scene
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.hypotheses import SLOTS
-from mechsearch_jax.perception.parts.segments import SegmentsConfig, connected_segments
+from mechsearch_jax.perception.parts.segments import Connected, SegmentsConfig, connected_segments
+from mechsearch_jax.perception.recognition import ShapeNetwork
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
@@ -137,3 +138,17 @@ def test_each_household_thing_of_a_shelf_has_one_segment():
         assert numbers[np.argmax(counts)] >= 0
         assert counts.max() > 0.95 * counts.sum()
     assert jnp.sum(after >= 0) >= 0.95 * np.sum((true >= 0) & (true < 4))
+    # Each has its object, whether one superquadric explains it or not.
+    fitted = Connected()(
+        jax.random.split(jax.random.key(1)),
+        seen,
+        ShapeNetwork.of(recogniser.weights),
+        view.camera,
+        snapshot.shelf,
+        recogniser.target,
+        recogniser.refinement,
+        least=SAMPLED * unseen,
+    )
+    np.testing.assert_array_equal(fitted.labels, after)
+    assert np.asarray(fitted.objects.valid).tolist() == [True] * 4 + [False] * 4
+    assert not np.asarray(fitted.changed).any()

@@ -33,8 +33,8 @@ TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default, and of the former ones. Fields of the page are named after them.
 RUNS = ("report-i-h200", "table1-narrow-sides-h200", "report-h-whole-h200", "collision-free-h200")
 # The default before, in the run of today's first one.
-CHANGED = "report-i-before-h200"
-# Of the default on scenes that it was chosen on.
+BEFORE = "report-i-before-h200"
+# Of the default before, on scenes that it was chosen on.
 PUBLISHED = "published-narrow-sides-h200"
 # Whose decisions are timed in a batch.
 BATCH = "one-ahead-c2-h200"
@@ -250,7 +250,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
         **default_rates(*runs),
-        "farther_sides": _change(true, load_run(stored.folder / "runs", CHANGED).rows)["all"],
+        "farther_sides": _change(true, load_run(stored.folder / "runs", BEFORE).rows)["all"],
         "published": with_interval(published, "retrieved"),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -24,6 +25,9 @@ from mechsearch_jax.workspace.target import Target
 
 # What the options of an episode hold beside the configuration's.
 _OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
+
+# What is an option today, as it was in episodes that do not hold it.
+_FORMER = {"retrieval_max_yaw": math.radians(45)}
 
 # Of the paths of a mismatch's settings among the options.
 MISMATCH_PREFIX = "mismatch."
@@ -141,7 +145,8 @@ class Method:
 
     @classmethod
     def of_options(cls, options: Mapping[str, Any]) -> Method:
-        """The method whose `options` these are; what they do not hold is as in the preset `standard`. It runs natively.
+        """The method whose `options` these are; what they do not hold is as in the preset `standard`, or as it was
+        before it was an option. It runs natively.
 
         Raises:
           InputError: a setting is impossible, or an option or the path of a setting is unknown.
@@ -150,7 +155,11 @@ class Method:
         unknown = [name for name in options if "." not in name and name not in option_names | _OF_EPISODES]
         if unknown:
             raise InputError(f"option {unknown[0]} is unknown to this version: what ran with it cannot be run again")
-        config = PRESETS["standard"](**{name: value for name, value in options.items() if name in option_names})
+        # An episode holds every option that there was.
+        former = _FORMER if "retrieval_tilts" in options else {}
+        config = PRESETS["standard"](
+            **former | {name: value for name, value in options.items() if name in option_names}
+        )
         parts: dict[str, Any] = {"config": config, "workcell": Workcell(), "mismatch": ASSUMED}
         for path, value in options.items():
             first, *rest = path.split(".")

@@ -4,7 +4,7 @@ Each segment has a superquadric. Where many of its points do not lie on it, or r
 fitted to parts of the points: to those that lie on no shape yet, and to both sides of the cuts that divide the points
 of the worst part into the most uniform halves. Of all these and of what there was, the union is kept that explains the
 segment's points and the free rays around it best, at a price for each part. That is repeated, and at last every part
-is fitted again to the points that are nearest to it. Bodies that then float are joined to those that they touch.
+is fitted again to the points that are nearest to it. Bodies that then float may be joined to those that they touch.
 """
 
 from __future__ import annotations
@@ -71,6 +71,7 @@ class PartsConfig(UnionCosts):
       border: how far those reach beyond the segment's bounding box, as a share of its sides.
       doubtful: a segment is tried in parts if one shape costs more, and ...
       doubtful_share: ... more than this share of its pixels.
+      joins: whether bodies that float are joined to what they touch, which leaves a mask's segments without a body.
     """
 
     rounds: int = 3
@@ -80,6 +81,7 @@ class PartsConfig(UnionCosts):
     border: float = 0.25
     doubtful: float = 12.0
     doubtful_share: float = 0.03
+    joins: bool = False
 
     def __post_init__(self):
         check_numbers(self, positive=("wrong", "points", "rays"))
@@ -153,20 +155,26 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
         better = several & (found < cost)
         parts, cost = _where(better, after, parts), jnp.where(better, found, cost)
     misfit = jax.vmap(lambda p, e: union_misfit(table_of(p, e, config), p.valid, e))(parts, evidence)
-    parts, owner = join_floating(parts, evidence, jnp.float32(shelf.board))
+    owner = slots
+    if config.joins:
+        parts, owner = join_floating(parts, evidence, jnp.float32(shelf.board))
     several = jnp.sum(parts.valid, axis=1) > 1
     of_body = owner[None] == slots[:, None]
     misfit, pixels = (jnp.sum(jnp.where(of_body, each[None], 0.0), axis=1) for each in (misfit, evidence.pixels))
     misfit = misfit / jnp.maximum(pixels, 1.0)
+    stands = base.valid & (owner == slots)
     measures = fitted.measures.replace(misfit=jnp.where(several, misfit, fitted.measures.misfit))
     confidence = jnp.where(several, confidence_of(measures), fitted.confidence)
+    confidence = jnp.where(stands | ~base.valid, confidence, 0.0)
     joined = jnp.sum(of_body & base.valid[None], axis=1) != 1
     of_object = (fitted.labels >= 0) & (fitted.labels < SLOTS)
     return fitted.replace(
-        objects=_bodies(base.replace(valid=base.valid & (owner == slots)), parts, frames),
+        objects=_bodies(base.replace(valid=stands), parts, frames),
         measures=measures,
         confidence=confidence,
-        labels=jnp.where(of_object, owner[jnp.clip(fitted.labels, 0, SLOTS - 1)], fitted.labels),
+        labels=jnp.where(of_object, owner[jnp.clip(fitted.labels, 0, SLOTS - 1)], fitted.labels).astype(
+            fitted.labels.dtype
+        ),
         changed=fitted.changed | (joined & base.valid),
     )
 
