@@ -42,9 +42,9 @@ from mechsearch_jax.workspace.target import Target
 TRIES = 8
 # Number of poses on the crossing of each grasp; with fewer the arm may pass a singularity unnoticed.
 CROSSINGS = 15
-# Poses of the way in where the arm is tested against objects: at most 5.5 cm apart, from 75
-# degrees to the side 6.5, and half of that before the fingers
-# close. Closer poses would rule out grasps that succeed, since the arm's model is a little wider than the arm.
+# Poses of the way in where the arm is tested against objects: at most 5.5 cm apart, 6.5 from 75 degrees to the side,
+# and half of that before the fingers close. Closer poses would rule out grasps that succeed, since the arm's model is a
+# little wider than the arm.
 ARM_POSES = np.array([*range(2, CROSSINGS, 4), *range(CROSSINGS, CROSSINGS + CLOSE_WAYPOINTS, 2)])
 # Amounts by which objects are grown to find the grasp with the most clearance [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)

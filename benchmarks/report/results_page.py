@@ -203,8 +203,11 @@ def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
-    """The fields of the template about what the default and the one before reach, with true shapes and from images."""
+def default_rates(
+    today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun, beside: StoredRun
+) -> dict[str, Any]:
+    """The fields of the template about what the default and the one before reach, with true shapes and from images;
+    `beside` is of the one before, in the run of today's."""
     former = Method(config=PRESETS["standard"](**FORMER_STANDARDS[WITHIN_45]))
     former_masks, former_full = (dataclasses.replace(former, recognition=name) for name in ("masks", "full"))
     front = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
@@ -230,6 +233,7 @@ def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, collis
                 **seen,
             },
         ),
+        "farther_sides": _change(new, beside.rows)["all"],
         "loss": _change(new_full, new),
         "loss_before": _change(old_full, old),
     }
@@ -240,7 +244,6 @@ def computed(stored: Stored) -> dict[str, Any]:
     new = stored.run("standard-h100", "c2")
     paper = stored.run("published-paper-h200", "search-for-grasp")
     runs = [load_run(stored.folder / "runs", name) for name in RUNS]
-    true = _on_new_scenes(runs[0], Method())
     clock = new["clock"]["nothing kept"]
     published = [vars(row) for row in load_run(stored.folder / "runs", PUBLISHED).rows]
     batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-one-ahead-batch-h200"]
@@ -249,8 +252,7 @@ def computed(stored: Stored) -> dict[str, Any]:
     return {
         **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
-        **default_rates(*runs),
-        "farther_sides": _change(true, load_run(stored.folder / "runs", BEFORE).rows)["all"],
+        **default_rates(*runs, load_run(stored.folder / "runs", BEFORE)),
         "published": with_interval(published, "retrieved"),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),

@@ -18,9 +18,9 @@ from mechsearch_jax.robot.entry import crossing_length, crossing_poses
 CLOSE_WAYPOINTS = 12
 # Number of places where an action's gripper and object are tested against unseen space.
 PLACES = 5
-# Number of places where a gripper is tested on its crossing. Crossings are at most 17 cm long, and 24 cm for a found
-# target from 75 degrees to the side, where places are 4.9 cm apart, an approximation. Else they are at
-# most 3.4 cm apart: less than the fingers measure along x at any yaw, so that the swept volume has no gaps.
+# Number of places where a gripper is tested on its crossing. Crossings are at most 17 cm long, so that places are at
+# most 3.4 cm apart: less than the fingers measure along x at any yaw, so that the swept volume has no gaps. An
+# approximation: crossings to a found target from 75 degrees to the side are up to 24 cm long, and places 4.9 cm apart.
 CROSSING_PLACES = 5
 # Number of places where an object in the hand is tested on its straight way in or out.
 SWEPT_PLACES = 7
