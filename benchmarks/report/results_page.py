@@ -204,7 +204,7 @@ def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
 
 
 def default_rates(
-    today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun, beside: StoredRun
+    today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun, *, beside: StoredRun
 ) -> dict[str, Any]:
     """The fields of the template about what the default and the one before reach, with true shapes and from images;
     `beside` is of the one before, in the run of today's."""
@@ -252,7 +252,7 @@ def computed(stored: Stored) -> dict[str, Any]:
     return {
         **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
-        **default_rates(*runs, load_run(stored.folder / "runs", BEFORE)),
+        **default_rates(*runs, beside=load_run(stored.folder / "runs", BEFORE)),
         "published": with_interval(published, "retrieved"),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
