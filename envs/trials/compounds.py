@@ -15,7 +15,7 @@ from mechsearch_jax.envs.world.compounds import body_at
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.shapes import PRIMITIVES, shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
 from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.target import Target
@@ -26,6 +26,9 @@ SMOOTH_EXPONENT = 0.6
 # they are as dense as full vessels [kg/m3] and of the roughest material, since what is heavier or rougher than in its
 # trial holds the arm up.
 DENSITY, FRICTION = 1000.0, 0.6
+# What stands on an ellipsoid would roll, and stood still as it was seen: it has a base, such as fruit and pots have. It
+# is this share of the ellipsoid's width, and so flat [m].
+BASE_SHARE, BASE_THICKNESS = 0.5, 0.008
 
 
 def _piece(size: np.ndarray, exponents: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> Piece:
@@ -40,16 +43,37 @@ def _piece(size: np.ndarray, exponents: np.ndarray, position: np.ndarray, rotati
     return Piece(shape, *(tuple(float(v) for v in values) for values in (half, position, quaternion)))  # pyright: ignore
 
 
-def compound_of(parts: Any) -> Compound:
-    """The compound of a body's parts, in the body's frame, of `DENSITY` and `FRICTION`.
+def compound_of(parts: Any, up: Float[np.ndarray, " 3"]) -> Compound:
+    """The compound of a body's parts, in the body's frame, of `DENSITY` and `FRICTION`; on a base if it would roll.
 
     Args:
       parts: a `Superquadrics` of a single body, as NumPy arrays; absent ones are left out.
+      up: the vertical, a unit vector in the body's frame.
     """
     there = np.flatnonzero(parts.valid)
     rows = [(parts.size[i], parts.exponents[i], parts.position[i], parts.rotation[i]) for i in there]
     pieces = tuple(_piece(*row) for row in rows)
-    return Compound(pieces, DENSITY, FRICTION)
+    return Compound((*pieces, *_base(pieces, up)), DENSITY, FRICTION)
+
+
+def _base(pieces: Sequence[Piece], up: Float[np.ndarray, " 3"]) -> list[Piece]:
+    """The base of a body whose lowest piece is an ellipsoid; empty for others, which stand on a face or an edge."""
+
+    def bottom(piece: Piece) -> float:
+        reach = PRIMITIVES[piece.shape].reach(piece.rotation.T @ up, np.array(piece.half_size), np)
+        return float(up @ piece.position - reach)
+
+    lowest = min(pieces, key=bottom)
+    if lowest.shape != "ellipsoid":
+        return []
+    # An ellipsoid's point that is farthest down, from its middle.
+    half = np.array(lowest.half_size)
+    down = -lowest.rotation @ (half**2 * (lowest.rotation.T @ up)) / np.linalg.norm(half * (lowest.rotation.T @ up))
+    radius, thick = BASE_SHARE * float(min(half[:2])), BASE_THICKNESS / 2
+    x, y, z = (np.array(lowest.position) + down + thick * up).tolist()
+    turn = Rotation.align_vectors(up[None], np.array([[0.0, 0.0, 1.0]]))[0]
+    quaternion = tuple(float(v) for v in turn.as_quat(scalar_first=True))
+    return [Piece("cylinder", (radius, radius, thick), (x, y, z), quaternion)]  # pyright: ignore
 
 
 def with_parts(
@@ -70,7 +94,7 @@ def with_parts(
         return made, origins
     for i in np.flatnonzero(objects.valid & (parts.valid.sum(axis=-1) > 1)):
         own: Any = Superquadrics(*(getattr(parts, name)[i] for name in _FIELDS))
-        compound, centre = centred(compound_of(own))
+        compound, centre = centred(compound_of(own, np.asarray(objects.rotation[i], float)[2]))
         body = made[i]
         assert body is not None
         position = np.asarray(objects.position[i], float) + np.asarray(objects.rotation[i], float) @ centre
