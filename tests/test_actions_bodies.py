@@ -8,6 +8,7 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import SAMPLED_KINDS, ActionKind, all_candidates, joint_trajectory
 from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig, object_grasps
+from mechsearch_jax.actions.kinds.placement import EDGE, ObjectGrasp, placement
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.belief.unseen_motion import reopened
@@ -205,6 +206,38 @@ def test_no_grasp_passes_through_another_part_of_the_same_body(problem):
         head_on = np.abs(np.arctan2(*np.asarray(found.T_world_gripper[0, :, [1, 0], 2]))) < 0.1
         round_one = (np.asarray(held) == 0) & head_on
         assert bool(np.asarray(found.reached[0])[round_one].any()) == some
+
+
+@pytest.mark.slow
+def test_a_body_of_several_parts_is_put_away_from_the_edge(problem):
+    belief = planner.initial_belief(problem)
+    possible = possible_space(problem, belief, belief.exists & False)
+    picks = [kind.surrounds_object for kind in SAMPLED_KINDS].index(True)
+    candidates = jax.jit(lambda scene: all_candidates(problem.space, scene, possible)[picks])
+    bottle = body(
+        (0.6, 0.1),
+        0.0,
+        ((0.03, 0.03, 0.07), CYLINDER, (0.0, 0.0, 0.07)),
+        ((0.03, 0.03, 0.03), CYLINDER, (0.0, 0.0, 0.17)),
+    )
+
+    @jax.jit
+    def places(keys, scene, T_world_gripper, wrist):
+        grasps = ObjectGrasp(jnp.zeros(len(wrist), jnp.int32), T_world_gripper, wrist, jnp.ones(len(wrist), bool))
+        return jax.vmap(lambda key, grasp: placement(key, problem.space, scene, possible, grasp))(keys, grasps)
+
+    def share_near_the_edge(scene):
+        found = candidates(scene)
+        reached = np.argwhere(np.asarray(found.reached[0]))
+        which, wrist = reached[np.arange(128) % len(reached)].T
+        keys = jax.random.split(jax.random.key(0), len(which))
+        able, _, T_world_object = places(keys, scene, found.T_world_gripper[0, which], jnp.asarray(wrist))
+        rim = np.asarray(T_world_object)[np.asarray(able), 0, 3] - 0.03 - problem.shelf.front
+        assert len(rim) > 16
+        return np.mean(rim < EDGE * 0.2)
+
+    assert share_near_the_edge(scene_of(bottle)) < 0.02
+    assert share_near_the_edge(scene_of(block((0.6, 0.1), 0.0, (0.03, 0.03, 0.1), CYLINDER))) > 0.1
 
 
 # --- a whole decision ------------------------------------------------------------------------------------------------

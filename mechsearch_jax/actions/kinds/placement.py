@@ -29,8 +29,10 @@ from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform, 
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.workspace.shelf import cloud_hits_shelf, hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf, hits_shelf
 
+# Nearer to the front edge than this share of its height a body may fall over it.
+EDGE = 0.25
 # Largest turn of a joint between taking an object out of the shelf and bringing it back in [rad].
 LARGEST_TRANSFER = 2.0
 # Number of places where an object in the hand is tested on its crossing. Crossings are at most 28 cm long, so that
@@ -129,8 +131,18 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     overlapping = jnp.any(overlaps, axis=1)
     intrudes = jnp.any(enters(possible, points), axis=1) & config.avoid_unseen
     score = order - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
+    if scene.parts is not None:
+        # It is often held by a narrow part, such as a neck, and let go askew.
+        several = jnp.sum(scene.parts.valid[index]) > 1
+        score -= several & _at_the_edge(shelf, points)
     _, best = jax.lax.top_k(score, tests)
     return position[best], rotation[best], turn[best], (~overlapping & on_board)[best]
+
+
+def _at_the_edge(shelf: Shelf, points: Float[Array, "tries p 3"]) -> Bool[Array, " tries"]:
+    """At which places a body with these points on its surface is so near to the front edge that it may fall over it."""
+    height = jnp.max(points[..., 2], axis=1) - shelf.board
+    return jnp.min(points[..., 0], axis=1) < shelf.front + EDGE * height
 
 
 def transfers(
