@@ -8,7 +8,7 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import SAMPLED_KINDS, ActionKind, all_candidates, joint_trajectory
 from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig, object_grasps
-from mechsearch_jax.actions.kinds.placement import EDGE, ObjectGrasp, placement
+from mechsearch_jax.actions.kinds.placement import EDGE_SHARE, ObjectGrasp, placement
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.belief.unseen_motion import reopened
@@ -234,7 +234,7 @@ def test_a_body_of_several_parts_is_put_away_from_the_edge(problem):
         able, _, T_world_object = places(keys, scene, found.T_world_gripper[0, which], jnp.asarray(wrist))
         rim = np.asarray(T_world_object)[np.asarray(able), 0, 3] - 0.03 - problem.shelf.front
         assert len(rim) > 16
-        return np.mean(rim < EDGE * 0.2)
+        return np.mean(rim < EDGE_SHARE * 0.2)
 
     assert share_near_the_edge(scene_of(bottle)) < 0.02
     assert share_near_the_edge(scene_of(block((0.6, 0.1), 0.0, (0.03, 0.03, 0.1), CYLINDER))) > 0.1

@@ -26,7 +26,7 @@ from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-UP = np.array([0.0, 0.0, 1.0])
+UP, STRAIGHT = np.array([0.0, 0.0, 1.0]), np.eye(3)
 BOX = Body("box", (0.054, 0.025, 0.054), (0.55, 0.35, 0.4585), UPRIGHT)
 TARGET_BODY = Body("cylinder", (0.02, 0.02, 0.05), (0.7, 0.0, 0.4545), UPRIGHT)
 
@@ -87,42 +87,57 @@ def test_parts_become_a_compound_of_their_volume():
     assert (made.density, made.friction) == (DENSITY, FRICTION)
 
 
-def pear(rotation=None):
-    """A pear as it is recognised: two ellipsoids on the board, in a body whose frame may be turned."""
-    turn = np.eye(3) if rotation is None else np.asarray(rotation)
-    radius, heights = np.array([0.034, 0.021]), np.array([0.034, 0.068])
-    size = np.stack([[r, r, h] for r, h in zip(radius, [0.034, 0.036], strict=True)])
-    middle = np.array([0.6, 0.0, Shelf().board + 0.05])
-    places = np.stack([[0.6, 0.0, Shelf().board + height] for height in heights])
-    parts = Superquadrics(
-        *(
-            jnp.asarray(field, jnp.float32)[None]
-            for field in (size, np.ones((2, 2)), (places - middle) @ turn, np.stack([turn.T, turn.T]))
-        ),
-        valid=jnp.ones((1, 2), bool),
-    )
-    whole = (np.array([0.034, 0.034, 0.05]), np.ones(2), middle, turn)
+def pear(turn=STRAIGHT, lie=STRAIGHT):
+    """A pear as it is recognised, two ellipsoids on the board.
+
+    Args:
+      turn: rotation of the body's frame in the world; the pear stands as it does whatever that is.
+      lie: rotation of the lower ellipsoid in the world.
+    """
+    foot = np.array([0.6, 0.0, Shelf().board])
+    size = np.array([[0.036, 0.030, 0.033], [0.021, 0.021, 0.036]])
+    below = np.linalg.norm(size[0] * lie[2])
+    places = foot + np.array([[0.0, 0.0, below], [0.0, 0.0, below + 0.04]])
+    middle = foot + np.array([0.0, 0.0, 0.05])
+    fields = (size, np.ones((2, 2)), (places - middle) @ turn, np.stack([turn.T @ lie, turn.T]))
+    parts = Superquadrics(*(jnp.asarray(field, jnp.float32)[None] for field in fields), valid=jnp.ones((1, 2), bool))
+    whole = (np.array([0.036, 0.036, 0.05]), np.ones(2), middle, turn)
     return Superquadrics(*(jnp.asarray(field, jnp.float32)[None] for field in whole), jnp.ones(1, bool), parts=parts)
 
 
-@pytest.mark.parametrize("axis", [(0, 0, 0), (np.pi / 2, 0, 0), (0.3, -1.2, 2.0)])
-def test_what_stands_on_an_ellipsoid_has_a_base(axis):
-    turn = Rotation.from_rotvec(axis).as_matrix()
-    body = jax.device_get(pear(turn))
+# Rotations of the lower ellipsoid, and its semi-axes seen from above.
+LYING = [((0, 0, 0.4), (0.036, 0.030)), ((np.pi / 2, 0, 0), (0.036, 0.033)), ((0, np.pi / 2, 0), (0.033, 0.030))]
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0), (np.pi / 2, 0, 0), (0.3, -1.2, 2.0)])
+@pytest.mark.parametrize(("lie", "level"), LYING)
+def test_what_stands_on_an_ellipsoid_has_a_base(turn, lie, level):
+    turn, lie = (Rotation.from_rotvec(vector).as_matrix() for vector in (turn, lie))
+    body = jax.device_get(pear(turn, lie))
     made = compound_of(jax.tree.map(lambda leaf: leaf[0], body.parts), turn[2])
     assert [piece.shape for piece in made.pieces] == ["ellipsoid", "ellipsoid", "cylinder"]
     base = made.pieces[-1]
     np.testing.assert_allclose(turn @ base.rotation[:, 2], UP, atol=1e-6)
     place = body.position[0] + turn @ np.array(base.position)
     np.testing.assert_allclose(place, [0.6, 0.0, Shelf().board + base.half_size[2]], atol=1e-6)
-    assert base.half_size[0] == pytest.approx(BASE_SHARE * 0.034)
+    assert base.half_size[0] == pytest.approx(BASE_SHARE * min(level), rel=1e-5)
 
 
-def test_what_stands_on_a_face_has_no_base():
-    things = jax.device_get(scenarios.superquadrics(SCENE.objects)).parts
-    for i in range(2):
-        own = jax.tree.map(lambda leaf, i=i: leaf[i], things)
-        assert len(compound_of(own, UP).pieces) == own.valid.sum()
+def test_the_base_of_a_tilted_ellipsoid_is_where_it_touches_the_board():
+    lie = Rotation.from_rotvec([0.5, 0.7, 0.2]).as_matrix()
+    body = jax.device_get(pear(lie=lie))
+    base = compound_of(jax.tree.map(lambda leaf: leaf[0], body.parts), UP).pieces[-1]
+    sphere = np.random.default_rng(0).normal(size=(400_000, 3))
+    size, position = body.parts.size[0, 0], body.position[0] + body.parts.position[0, 0]
+    points = position + (sphere / np.linalg.norm(sphere, axis=1, keepdims=True) * size) @ lie.T
+    lowest = points[points[:, 2].argmin()]
+    np.testing.assert_allclose((body.position[0] + base.position)[:2], lowest[:2], atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["mug", "drill", "apple", "pear", "teapot", "salt-shaker"])
+def test_true_household_things_stand_on_feet_of_their_own(name):
+    own = jax.tree.map(lambda leaf: leaf[0], jax.device_get(scenarios.superquadrics((standing(name, 0.0),))).parts)
+    assert len(compound_of(own, UP).pieces) == own.valid.sum()
 
 
 def test_a_recognised_pear_does_not_roll_away_in_a_trial():

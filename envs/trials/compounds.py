@@ -26,8 +26,8 @@ SMOOTH_EXPONENT = 0.6
 # they are as dense as full vessels [kg/m3] and of the roughest material, since what is heavier or rougher than in its
 # trial holds the arm up.
 DENSITY, FRICTION = 1000.0, 0.6
-# What stands on an ellipsoid would roll, and stood still as it was seen: it has a base, such as fruit and pots have. It
-# is this share of the ellipsoid's width, and so flat [m].
+# What stands on an ellipsoid would roll, and stood still as it was seen: it has a base, as the fruit and pots of
+# `household.toml` have. It is this share of the ellipsoid's width, and so flat [m].
 BASE_SHARE, BASE_THICKNESS = 0.5, 0.008
 
 
@@ -44,7 +44,9 @@ def _piece(size: np.ndarray, exponents: np.ndarray, position: np.ndarray, rotati
 
 
 def compound_of(parts: Any, up: Float[np.ndarray, " 3"]) -> Compound:
-    """The compound of a body's parts, in the body's frame, of `DENSITY` and `FRICTION`; on a base if it would roll.
+    """The compound of a body's parts, in the body's frame, of `DENSITY` and `FRICTION`; an ellipsoid stands on a base.
+
+    An approximation: a cylinder that lies has none, and may roll.
 
     Args:
       parts: a `Superquadrics` of a single body, as NumPy arrays; absent ones are left out.
@@ -57,7 +59,7 @@ def compound_of(parts: Any, up: Float[np.ndarray, " 3"]) -> Compound:
 
 
 def _base(pieces: Sequence[Piece], up: Float[np.ndarray, " 3"]) -> list[Piece]:
-    """The base of a body whose lowest piece is an ellipsoid; empty for others, which stand on a face or an edge."""
+    """The base of a body whose lowest piece is an ellipsoid; empty for others."""
 
     def bottom(piece: Piece) -> float:
         reach = PRIMITIVES[piece.shape].reach(piece.rotation.T @ up, np.array(piece.half_size), np)
@@ -66,14 +68,15 @@ def _base(pieces: Sequence[Piece], up: Float[np.ndarray, " 3"]) -> list[Piece]:
     lowest = min(pieces, key=bottom)
     if lowest.shape != "ellipsoid":
         return []
-    # An ellipsoid's point that is farthest down, from its middle.
-    half = np.array(lowest.half_size)
-    down = -lowest.rotation @ (half**2 * (lowest.rotation.T @ up)) / np.linalg.norm(half * (lowest.rotation.T @ up))
-    radius, thick = BASE_SHARE * float(min(half[:2])), BASE_THICKNESS / 2
-    x, y, z = (np.array(lowest.position) + down + thick * up).tolist()
+    half, own_up = np.array(lowest.half_size), lowest.rotation.T @ up
+    # An ellipsoid's point that is farthest down, from its middle; and its semi-axes as seen from above.
+    down = -lowest.rotation @ (half**2 * own_up) / np.linalg.norm(half * own_up)
+    level = np.linalg.svd(up[None])[2][1:]
+    radius = BASE_SHARE * float(np.linalg.svd(level @ lowest.rotation * half, compute_uv=False).min())
+    x, y, z = (np.array(lowest.position) + down + BASE_THICKNESS / 2 * up).tolist()
     turn = Rotation.align_vectors(up[None], np.array([[0.0, 0.0, 1.0]]))[0]
     quaternion = tuple(float(v) for v in turn.as_quat(scalar_first=True))
-    return [Piece("cylinder", (radius, radius, thick), (x, y, z), quaternion)]  # pyright: ignore
+    return [Piece("cylinder", (radius, radius, BASE_THICKNESS / 2), (x, y, z), quaternion)]  # pyright: ignore
 
 
 def with_parts(

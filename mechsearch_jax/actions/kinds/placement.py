@@ -31,8 +31,8 @@ from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf, hits_shelf
 
-# Nearer to the front edge than this share of its height a body may fall over it.
-EDGE = 0.25
+# A body that stands nearer to the front edge than this share of its height may fall over the edge.
+EDGE_SHARE = 0.25
 # Largest turn of a joint between taking an object out of the shelf and bringing it back in [rad].
 LARGEST_TRANSFER = 2.0
 # Number of places where an object in the hand is tested on its crossing. Crossings are at most 28 cm long, so that
@@ -107,7 +107,8 @@ def placement(
 def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, cloud, grasp: ObjectGrasp):
     """Random places for a picked object, most promising first: (position, rotation, turn, whether it can stand there).
 
-    Places that overlap other objects or the shelf come last, and before these the places in possible space.
+    Places that overlap other objects or the shelf come last, before these the places in possible space, and before
+    these, for a body of several parts, those at the front edge. `order` is below 1, so that each rule outweighs it.
     """
     shelf, config, index, T_grasp = space.shelf, space.config, grasp.object, grasp.T_world_gripper
     tries, tests = config.placements
@@ -132,7 +133,7 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     intrudes = jnp.any(enters(possible, points), axis=1) & config.avoid_unseen
     score = order - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
     if scene.parts is not None:
-        # It is often held by a narrow part, such as a neck, and let go askew.
+        # Such a body is often held by a narrow part, a neck, and let go askew. Which part holds it is not considered.
         several = jnp.sum(scene.parts.valid[index]) > 1
         score -= several & _at_the_edge(shelf, points)
     _, best = jax.lax.top_k(score, tests)
@@ -142,7 +143,7 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
 def _at_the_edge(shelf: Shelf, points: Float[Array, "tries p 3"]) -> Bool[Array, " tries"]:
     """At which places a body with these points on its surface is so near to the front edge that it may fall over it."""
     height = jnp.max(points[..., 2], axis=1) - shelf.board
-    return jnp.min(points[..., 0], axis=1) < shelf.front + EDGE * height
+    return jnp.min(points[..., 0], axis=1) < shelf.front + EDGE_SHARE * height
 
 
 def transfers(
