@@ -192,12 +192,17 @@ def test_a_round_part_does_not_turn_in_the_hand_and_a_flat_one_takes_the_body_wi
     close(after.parts, scene.parts)
 
 
-@pytest.mark.slow
-def test_no_grasp_passes_through_another_part_of_the_same_body(problem):
+def picks_of(problem):
+    """A function from a scene to its candidates of picking, and the space that the target may fill: none."""
     belief = planner.initial_belief(problem)
     possible = possible_space(problem, belief, belief.exists & False)
     picks = [kind.surrounds_object for kind in SAMPLED_KINDS].index(True)
-    candidates = jax.jit(lambda scene: all_candidates(problem.space, scene, possible)[picks])
+    return jax.jit(lambda scene: all_candidates(problem.space, scene, possible)[picks]), possible
+
+
+@pytest.mark.slow
+def test_no_grasp_passes_through_another_part_of_the_same_body(problem):
+    candidates, _ = picks_of(problem)
     behind = scene_of(mug((0.55, 0.1), 0.0, back=0.03, share=0.95))
     towards = scene_of(mug((0.55, 0.1), np.pi, back=0.03, share=0.95))
     for scene, some in ((behind, True), (towards, False)):
@@ -210,10 +215,7 @@ def test_no_grasp_passes_through_another_part_of_the_same_body(problem):
 
 @pytest.mark.slow
 def test_a_body_of_several_parts_is_put_away_from_the_edge(problem):
-    belief = planner.initial_belief(problem)
-    possible = possible_space(problem, belief, belief.exists & False)
-    picks = [kind.surrounds_object for kind in SAMPLED_KINDS].index(True)
-    candidates = jax.jit(lambda scene: all_candidates(problem.space, scene, possible)[picks])
+    candidates, possible = picks_of(problem)
     bottle = body(
         (0.6, 0.1),
         0.0,
