@@ -1,6 +1,5 @@
 """Segments that one superquadric does not explain become bodies of several; all others stay as they are."""
 
-import dataclasses
 import itertools
 
 import hypothesis.extra.numpy as arrays
@@ -21,6 +20,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception.explanation import as_segmented
 from mechsearch_jax.perception.parts.divisions import BOX, CYLINDER, ELLIPSOID, best_cut
 from mechsearch_jax.perception.parts.in_parts import InParts, PartsConfig, depth_noise, in_parts
+from mechsearch_jax.perception.parts.joining import join_floating, separate
 from mechsearch_jax.perception.parts.segments import Connected
 from mechsearch_jax.perception.parts.unions import (
     Evidence,
@@ -127,7 +127,7 @@ def test_a_scene_of_boxes_and_cylinders_is_the_same_with_and_without_parts():
 
 
 def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
-    """A bottle whose neck is a segment of its own: with `joins` both are one body, else each stays in its slot."""
+    """A bottle whose neck is a segment of its own: with `join_floating` both are one body, else each has a slot."""
     image, view, _ = seen(thing("wine-bottle", 0.55, -0.05))
     high = (image.labels == 0) & (image.points[..., 2] > SHELF.board + 0.2)
     assert 20 < int(jnp.sum(high)) < int(jnp.sum(image.labels == 0))
@@ -136,11 +136,10 @@ def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
     base = as_segmented(keys, divided, ShapeNetwork.of(), view.camera, SHELF, TARGET, RefinementConfig())
     assert np.asarray(base.objects.valid)[:2].all()
     config = PartsConfig(rounds=1, refits=1, points=128, rays=128)
-    apart, joined = (
-        in_parts(divided, base, view.camera, SHELF, dataclasses.replace(config, joins=joins)) for joins in (False, True)
-    )
-    assert np.asarray(apart.objects.valid)[:2].tolist() == [True, True]
-    np.testing.assert_array_equal(apart.labels, divided.labels)
+    ways = (separate, join_floating)
+    kept, joined = (in_parts(divided, base, view.camera, SHELF, config, joining) for joining in ways)
+    assert np.asarray(kept.objects.valid)[:2].tolist() == [True, True]
+    np.testing.assert_array_equal(kept.labels, divided.labels)
     assert np.asarray(joined.objects.valid)[:2].tolist() == [True, False]
     assert joined.labels.dtype == divided.labels.dtype
     np.testing.assert_array_equal(joined.labels == 0, divided.labels >= 0)
@@ -152,8 +151,8 @@ def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
 def test_parts_are_off_unless_they_are_named():
     assert recogniser("masks", TARGET).fitter is as_segmented
     # A mask's segments are kept.
-    assert recogniser("masks-parts", TARGET).fitter == InParts(as_segmented, PartsConfig(joins=False))
-    assert recogniser("full-parts", TARGET).fitter == InParts(Connected(), PartsConfig(joins=True))
+    assert recogniser("masks-parts", TARGET).fitter == InParts(as_segmented, joining=separate)
+    assert recogniser("full-parts", TARGET).fitter == InParts(Connected(), joining=join_floating)
     assert not isinstance(recogniser("full", TARGET).fitter, InParts)
 
 

@@ -35,7 +35,8 @@ from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, m
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.explanation import Explaining, Fitter, as_segmented
-from mechsearch_jax.perception.parts.in_parts import InParts, PartsConfig
+from mechsearch_jax.perception.parts.in_parts import InParts
+from mechsearch_jax.perception.parts.joining import join_floating
 from mechsearch_jax.perception.parts.segments import Connected
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
@@ -276,5 +277,5 @@ def _with_masks(target: Target, several: bool) -> ImageRecogniser:
 @functools.cache
 def _alone(target: Target, detector: TargetColour, several: bool) -> ColourRecogniser:
     segmenter = WeightedSegmenter(shipped_weights("segmentation"))
-    fitter = InParts(Connected(), PartsConfig(joins=True)) if several else Explaining()
+    fitter = InParts(Connected(), joining=join_floating) if several else Explaining()
     return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"), fitter=fitter)

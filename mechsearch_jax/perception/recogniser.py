@@ -111,8 +111,8 @@ class Recogniser:
           detector: by default for a red target in any light, `TargetColour.lit()`.
           refinement: the default if None.
           fitter: by default `Explaining()`, which splits, joins and drops segments where that explains the image
-            better; `as_segmented` keeps the segmenter's. With `InParts(Connected(), PartsConfig(joins=True))`
-            of `parts.in_parts` and `parts.segments` objects are bodies of up to four parts.
+            better; `as_segmented` keeps the segmenter's. With `InParts(Connected(), joining=join_floating)`
+            of `parts.in_parts`, `parts.segments` and `parts.joining` objects are bodies of up to four parts.
           mask_fitter: by default `as_segmented`, which keeps the mask's segments, as `parts.in_parts.InParts()` does.
 
         Raises:

@@ -26,7 +26,7 @@ from mechsearch_jax.perception.confidence import confidence_of
 from mechsearch_jax.perception.explanation import Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.hypotheses import SLOTS
 from mechsearch_jax.perception.parts.divisions import Frame, frame_of, guesses, halves, in_frame
-from mechsearch_jax.perception.parts.joining import join_floating
+from mechsearch_jax.perception.parts.joining import Joining, separate
 from mechsearch_jax.perception.parts.unions import (
     Evidence,
     UnionCosts,
@@ -71,7 +71,6 @@ class PartsConfig(UnionCosts):
       border: how far those reach beyond the segment's bounding box, as a share of its sides.
       doubtful: a segment is tried in parts if one shape costs more, and ...
       doubtful_share: ... more than this share of its pixels.
-      joins: whether bodies that float are joined to what they touch, which leaves a mask's segments without a body.
     """
 
     rounds: int = 3
@@ -81,7 +80,6 @@ class PartsConfig(UnionCosts):
     border: float = 0.25
     doubtful: float = 12.0
     doubtful_share: float = 0.03
-    joins: bool = False
 
     def __post_init__(self):
         check_numbers(self, positive=("wrong", "points", "rays"))
@@ -94,10 +92,13 @@ class InParts:
     Attributes:
       of: the other one.
       config: of the parts.
+      joining: which of the bodies are one; by default each keeps its segment. With `join_floating` a mask's segment
+        may be left without a body.
     """
 
     of: Fitter = as_segmented
     config: PartsConfig = dataclasses.field(default_factory=PartsConfig)
+    joining: Joining = separate
 
     def __call__(
         self,
@@ -111,11 +112,18 @@ class InParts:
         least: float = 0.0,
     ) -> Fitted:
         fitted = self.of(keys, image, shapes, camera, shelf, target, refinement, least)
-        return in_parts(image, fitted, camera, shelf, self.config)
+        return in_parts(image, fitted, camera, shelf, self.config, self.joining)
 
 
-@kept(static_argnames=("config",))
-def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf, config: PartsConfig) -> Fitted:
+@kept(static_argnames=("config", "joining"))
+def in_parts(
+    image: LabelledImage,
+    fitted: Fitted,
+    camera: Camera,
+    shelf: Shelf,
+    config: PartsConfig,
+    joining: Joining = separate,
+) -> Fitted:
     """What was made of an image, with its objects as bodies of parts in the same slots.
 
     The confidence in a body of several parts is that of an object with the misfit of all parts together.
@@ -124,7 +132,7 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
       image: of the camera.
       fitted: what was made of it.
       camera, shelf: of the image.
-      config: static.
+      config, joining: as of `InParts`, static.
     """
     base = fitted.objects
     eye = jnp.array(camera.position)
@@ -155,9 +163,7 @@ def in_parts(image: LabelledImage, fitted: Fitted, camera: Camera, shelf: Shelf,
         better = several & (found < cost)
         parts, cost = _where(better, after, parts), jnp.where(better, found, cost)
     misfit = jax.vmap(lambda p, e: union_misfit(table_of(p, e, config), p.valid, e))(parts, evidence)
-    owner = slots
-    if config.joins:
-        parts, owner = join_floating(parts, evidence, jnp.float32(shelf.board))
+    parts, owner = joining(parts, evidence, jnp.float32(shelf.board))
     several = jnp.sum(parts.valid, axis=1) > 1
     of_body = owner[None] == slots[:, None]
     misfit, pixels = (jnp.sum(jnp.where(of_body, each[None], 0.0), axis=1) for each in (misfit, evidence.pixels))

@@ -3,6 +3,8 @@ of another one, such as the neck of a bottle whose segment was divided."""
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -17,10 +19,23 @@ FLOATS = 0.01
 TOUCHES = 0.01
 
 
+class Joining(Protocol):
+    """Decides which recognised bodies are one; see `join_floating` for the arguments and what comes back."""
+
+    def __call__(
+        self, parts: Superquadrics, evidence: Evidence, board: Array | float
+    ) -> tuple[Superquadrics, Int[Array, " n"]]: ...
+
+
+def separate(parts: Superquadrics, evidence: Evidence, board: Array | float) -> tuple[Superquadrics, Int[Array, " n"]]:
+    """A `Joining` by which every body stays one of its own."""
+    return parts, jnp.arange(parts.valid.shape[0])
+
+
 def join_floating(
     parts: Superquadrics, evidence: Evidence, board: Array | float
 ) -> tuple[Superquadrics, Int[Array, " n"]]:
-    """Bodies of which none floats that touches another one.
+    """A `Joining`: bodies of which none floats that touches another one.
 
     The floating body that is nearest to another is joined to it, as often as there is one. Of more parts than there is
     room for, the largest are kept.
