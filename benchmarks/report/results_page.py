@@ -246,7 +246,7 @@ def computed(stored: Stored) -> dict[str, Any]:
     runs = [load_run(stored.folder / "runs", name) for name in RUNS]
     clock = new["clock"]["nothing kept"]
     published = [vars(row) for row in load_run(stored.folder / "runs", PUBLISHED).rows]
-    batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-one-ahead-batch-h200"]
+    batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-farther-sides-batch-h200"]
     frictions = {"same": "X1", "half": "X5", "double": "X2"}
     starts = stored["scenes-start-cpu"]["summary"]
     return {
