@@ -136,8 +136,12 @@ def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
     base = as_segmented(keys, divided, ShapeNetwork.of(), view.camera, SHELF, TARGET, RefinementConfig())
     assert np.asarray(base.objects.valid)[:2].all()
     config = PartsConfig(rounds=1, refits=1, points=128, rays=128)
-    ways = (separate, join_floating)
-    kept, joined = (in_parts(divided, base, view.camera, SHELF, config, joining) for joining in ways)
+
+    def none_floats(parts, evidence, board):
+        return join_floating(parts, evidence, board + 1.0)
+
+    ways = (separate, join_floating, none_floats)
+    kept, joined, other = (in_parts(divided, base, view.camera, SHELF, config, joining) for joining in ways)
     assert np.asarray(kept.objects.valid)[:2].tolist() == [True, True]
     np.testing.assert_array_equal(kept.labels, divided.labels)
     assert np.asarray(joined.objects.valid)[:2].tolist() == [True, False]
@@ -146,6 +150,8 @@ def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
     assert np.asarray(joined.changed)[0]
     assert np.asarray(joined.confidence)[1] == 0.0
     assert np.sum(np.asarray(joined.objects.parts.valid)[0]) >= 2
+    np.testing.assert_array_equal(other.labels, kept.labels)
+    np.testing.assert_array_equal(other.objects.parts.valid, kept.objects.parts.valid)
 
 
 def test_parts_are_off_unless_they_are_named():

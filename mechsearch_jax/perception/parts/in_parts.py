@@ -93,7 +93,7 @@ class InParts:
       of: the other one.
       config: of the parts.
       joining: which of the bodies are one; by default each keeps its segment. With `join_floating` a mask's segment
-        may be left without a body.
+        may be left without a body. With a function of one's own every process compiles anew.
     """
 
     of: Fitter = as_segmented

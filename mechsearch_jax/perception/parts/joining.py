@@ -1,5 +1,8 @@
-"""Joins recognised bodies that float to what they touch: things stand on the board, so that a body above it is a piece
-of another one, such as the neck of a bottle whose segment was divided."""
+"""Which recognised bodies are one: by `separate` none, by `join_floating` those that float and what they touch.
+
+Things stand on the board, so that a body above it is a piece of another one, such as the neck of a bottle whose segment
+was divided.
+"""
 
 from __future__ import annotations
 
@@ -20,33 +23,44 @@ TOUCHES = 0.01
 
 
 class Joining(Protocol):
-    """Decides which recognised bodies are one; see `join_floating` for the arguments and what comes back."""
+    """Decides which recognised bodies are one. It is traced, and hashable: a function, not a new lambda each time."""
 
     def __call__(
         self, parts: Superquadrics, evidence: Evidence, board: Array | float
-    ) -> tuple[Superquadrics, Int[Array, " n"]]: ...
+    ) -> tuple[Superquadrics, Int[Array, " n"]]:
+        """Join bodies.
+
+        Args:
+          parts: of N bodies in the world, fields (N, P, ...).
+          evidence: the points of each body's segment, fields (N, ...).
+          board: height of the board [m].
+
+        Returns:
+          The parts, in the same shapes: those of joined bodies with the body that they belong to, none left where they
+          were. And for each body the number of the one that it belongs to: its own where it is not joined or not
+          there, never that of a body which is joined itself.
+        """
+        ...
 
 
 def separate(parts: Superquadrics, evidence: Evidence, board: Array | float) -> tuple[Superquadrics, Int[Array, " n"]]:
-    """A `Joining` by which every body stays one of its own."""
+    """The `Joining` by which every body stays one of its own; parts (N, P, ...) as they are, and numbers (N,)."""
     return parts, jnp.arange(parts.valid.shape[0])
 
 
 def join_floating(
     parts: Superquadrics, evidence: Evidence, board: Array | float
 ) -> tuple[Superquadrics, Int[Array, " n"]]:
-    """A `Joining`: bodies of which none floats that touches another one.
+    """The `Joining` after which no body floats that touches another one.
 
     The floating body that is nearest to another is joined to it, as often as there is one. Of more parts than there is
     room for, the largest are kept.
 
     Args:
-      parts: of N bodies in the world, fields (N, P, ...).
-      evidence: the points of each body's segment, fields (N, ...).
-      board: height of the board [m].
+      parts, evidence, board: see `Joining`.
 
     Returns:
-      The parts; and for each body the number of the one that it belongs to now, mostly its own.
+      See `Joining`.
     """
     n = parts.valid.shape[0]
     there = jnp.any(parts.valid, axis=1)
