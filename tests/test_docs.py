@@ -453,11 +453,11 @@ def test_what_household_things_cost_is_what_is_stored():
 def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
     readme, runs = " ".join(read("README.md").split()), RESULTS / "runs"
 
-    def costs(known, worlds, counts=(2, 4, 6, 8)):
+    def costs(known_run, worlds_run, counts=(2, 4, 6, 8)):
         """Points of retrieved that each kind of world costs, by what is drawn in it."""
-        known = [row for row in load_run(runs, known).rows if row.recognition == "oracle"]
+        known = [row for row in load_run(runs, known_run).rows if row.recognition == "oracle"]
         groups = {}
-        for row in load_run(runs, worlds).rows:
+        for row in load_run(runs, worlds_run).rows:
             if row.objects in counts:
                 spread = tuple(sorted(name.split(".")[1] for name in options_of(row) if name.endswith("_spread")))
                 groups.setdefault(spread, []).append(row)
@@ -468,11 +468,26 @@ def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
     friction, sizes = ("friction_spread", "mass_spread"), ("size_spread",)
     today, crowded = (costs("report-i-h200", "report-i-worlds-h200", counts) for counts in ((2, 4, 6, 8), (8,)))
     before = costs("report-h-whole-h200", "report-h-worlds-h200")
-    log = "docs/experiments.md#household-things-and-other-worlds-on-whole-sets"
+    log, log_before = (
+        f"docs/experiments.md#{entry}"
+        for entry in ("household-things-and-other-worlds-on-whole-sets", "todays-default-on-all-that-is-measured")
+    )
     assert (
         f"Where friction and mass of each body are half to twice what is assumed, [{today[friction]} points "
-        f"fewer]({log}) are retrieved there, with 8 objects {crowded[friction]}; where shapes are up to 5% off, {today[sizes]}; with "
-        f"both, by the default before on `report-h`, {before[tuple(sorted((*friction, *sizes)))]}."
+        f"fewer]({log}) are retrieved on `report-i`, with 8 objects {crowded[friction]}; where shapes are up to 5% "
+        f"off, {today[sizes]}; on `report-h`, by the default before, [{before[friction]} and {before[sizes]}, with "
+        f"both {before[tuple(sorted((*friction, *sizes)))]}]({log_before})."
+    ) in readme
+    assumed = [row for row in load_run(runs, "report-i-h200").rows if row.recognition == "oracle"]
+    worlds = {False: [], True: []}
+    for row in load_run(runs, "report-i-worlds-h200").rows:
+        worlds["mismatch.size_spread" in options_of(row)].append(row)
+    as_assumed, rough, off = (
+        statistics.mean(row.retrieved for row in rows if row.objects == 8) for rows in (assumed, *worlds.values())
+    )
+    assert (
+        f"half to twice that, [{rough:.2f} instead of {as_assumed:.2f} are retrieved with 8 objects]({log}) on "
+        f"`report-i`, where shapes are up to 5% off {off:.2f};"
     ) in readme
 
 

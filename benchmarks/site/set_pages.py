@@ -211,7 +211,9 @@ def _rates(name: str, lines: Iterable[Line], about: About) -> dict[str, Any]:
     return {
         "tables": rate_tables(shown),
         "scope": "Shares are of episodes on scenes that nothing was chosen on." if partly else "",
-        "others": f"Other variants ran on it in {links}: [studies](../studies.md)." if others else "",
+        "others": f"Other variants ran on it in {links}: [studies](../studies.md), [log](../experiments.md)."
+        if others
+        else "",
     }
 
 

@@ -97,7 +97,8 @@ ABOUT: dict[str, About] = {
         "friction; `report-g` by what the default until 2026-11-28 comes to, also where friction, masses and shapes "
         "are not known; "
         "`report-h` by what grasps of the narrow sides of boxes gain (000 to 059), and then by what the default with "
-        "them comes to; `report-i` by what the default comes to whose retrievals are within 75 instead of 45 degrees. "
+        "them comes to; `report-i` by what the default comes to whose retrievals are within 75 instead of 45 degrees, "
+        "and then by it where friction and shapes are not known. "
         "Runs up to `trials-before-h200` are of before both.",
         sets=tuple(f"report-{letter}" for letter in "abcdefghi"),
     ),
@@ -133,7 +134,9 @@ ABOUT: dict[str, About] = {
     "report-household": About(
         "household things, to report with",
         "As [`household`](household.md), from seeds that no other set has. How things are recognised was tried and "
-        "chosen on `household`; here is what that comes to, so no picture of these scenes is shown.",
+        "chosen on `household`; here is what that comes to, so no picture of these scenes is shown. "
+        "`report-household-no-bases-h200` is of the code before what stands on an ellipsoid had a base in trials, "
+        "`report-household-h200` of the same in another run.",
         "As [`household`](household.md) is, from the seeds below.",
     ),
     "published": About(
