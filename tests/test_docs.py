@@ -451,23 +451,29 @@ def test_what_household_things_cost_is_what_is_stored():
 
 
 def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
-    readme, runs = " ".join(read("README.md").split()), RESULTS / "runs"
+    readme, friction, sizes = " ".join(read("README.md").split()), ("friction_spread", "mass_spread"), ("size_spread",)
 
-    def costs(known_run, worlds_run, counts=(2, 4, 6, 8)):
-        """Points of retrieved that each kind of world costs, by what is drawn in it."""
-        known = [row for row in load_run(runs, known_run).rows if row.recognition == "oracle"]
+    def assumed(run):
+        return [row for row in load_run(RESULTS / "runs", run).rows if row.recognition == "oracle"]
+
+    def drawn(run):
+        """The rows of a run by what is drawn in their worlds."""
         groups = {}
-        for row in load_run(runs, worlds_run).rows:
-            if row.objects in counts:
-                spread = tuple(sorted(name.split(".")[1] for name in options_of(row) if name.endswith("_spread")))
-                groups.setdefault(spread, []).append(row)
-        changes = {name: change_of(same_episodes(rows, known), OUTCOMES["retrieved"]) for name, rows in groups.items()}
+        for row in load_run(RESULTS / "runs", run).rows:
+            spread = tuple(sorted(name.split(".")[1] for name in options_of(row) if name.endswith("_spread")))
+            groups.setdefault(spread, []).append(row)
+        return groups
+
+    def costs(worlds, known, counts=(2, 4, 6, 8)):
+        """Points of retrieved that each kind of world costs."""
+        counted = {name: [row for row in rows if row.objects in counts] for name, rows in worlds.items()}
+        changes = {name: change_of(same_episodes(rows, known), OUTCOMES["retrieved"]) for name, rows in counted.items()}
         assert all(change.pairs == 200 * len(counts) for change in changes.values())
         return {name: f"{-100 * change.mean:.1f}" for name, change in changes.items()}
 
-    friction, sizes = ("friction_spread", "mass_spread"), ("size_spread",)
-    today, crowded = (costs("report-i-h200", "report-i-worlds-h200", counts) for counts in ((2, 4, 6, 8), (8,)))
-    before = costs("report-h-whole-h200", "report-h-worlds-h200")
+    known, worlds = assumed("report-i-h200"), drawn("report-i-worlds-h200")
+    today, crowded = costs(worlds, known), costs(worlds, known, (8,))
+    before = costs(drawn("report-h-worlds-h200"), assumed("report-h-whole-h200"))
     log, log_before = (
         f"docs/experiments.md#{entry}"
         for entry in ("household-things-and-other-worlds-on-whole-sets", "todays-default-on-all-that-is-measured")
@@ -478,12 +484,9 @@ def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
         f"off, {today[sizes]}; on `report-h`, by the default before, [{before[friction]} and {before[sizes]}, with "
         f"both {before[tuple(sorted((*friction, *sizes)))]}]({log_before})."
     ) in readme
-    assumed = [row for row in load_run(runs, "report-i-h200").rows if row.recognition == "oracle"]
-    worlds = {False: [], True: []}
-    for row in load_run(runs, "report-i-worlds-h200").rows:
-        worlds["mismatch.size_spread" in options_of(row)].append(row)
     as_assumed, rough, off = (
-        statistics.mean(row.retrieved for row in rows if row.objects == 8) for rows in (assumed, *worlds.values())
+        statistics.mean(row.retrieved for row in rows if row.objects == 8)
+        for rows in (known, worlds[friction], worlds[sizes])
     )
     assert (
         f"half to twice that, [{rough:.2f} instead of {as_assumed:.2f} are retrieved with 8 objects]({log}) on "
