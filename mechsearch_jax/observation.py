@@ -18,12 +18,15 @@ class Observation(flax.struct.PyTreeNode):
       target_pose: x, y [m] and yaw [rad] in the world, shape (..., 3); arbitrary if it is not visible.
       confidence: the probability that each object is where it is and as it is, to 2 cm and 15 degrees, shape (..., N);
         see `perception.confidence`. 1 for true shapes, 0 for absent objects; None if nothing says how sure they are.
+      measured: the share of each pixel of a coarse image that was measured, see `images.measured.measured_share`, shape
+        (..., h, w); None if everything was. Where nothing was measured the target, and anything else, may be.
     """
 
     objects: Superquadrics
     target_visible: jax.Array
     target_pose: jax.Array
     confidence: jax.Array | None = None
+    measured: jax.Array | None = None
 
     def judged(self) -> Observation:
         """The same observation with a confidence: 1 for every object if there is none."""

@@ -187,10 +187,12 @@ def _possible(recording: Recording, step: RecordedStep) -> PossibleSpace:
     """Where a target that is not found may be: as `belief.possible_space`, without a problem."""
     target, shelf = recording.target, recording.shelf
     grid = step.existence.reshape(*target.grid, -1).sum(axis=-1) * (not step.found)
+    cell = np.asarray(target.cell(shelf)[:2], np.float32)
+    space = bordered(widen(jnp.asarray(grid > 0)), False)
     return PossibleSpace(
-        occupied=widen(jnp.asarray(grid > 0)),
+        target=jnp.where(space, jnp.float32(shelf.board + target.tall), -jnp.inf),
+        unmeasured=jnp.full(space.shape, -jnp.inf),
         chance=jnp.asarray(grid / max(grid.sum(), 1), jnp.float32),
-        origin=jnp.asarray(target.candidate_poses(shelf)[0, :2], jnp.float32),
-        cell=jnp.asarray(target.cell(shelf)[:2], jnp.float32),
-        top=jnp.float32(shelf.board + target.tall),
+        origin=jnp.asarray(target.candidate_poses(shelf)[0, :2] - BORDER * cell, jnp.float32),
+        cell=jnp.asarray(cell),
     )

@@ -10,19 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
-from mechsearch_jax.belief.unseen_motion import reopened
-from mechsearch_jax.existence import allowances, closer_image, existence, object_views, plainly_elsewhere
+from mechsearch_jax.actions.unseen_space import BORDER, PossibleSpace, bordered, enters_unmeasured, widen
+from mechsearch_jax.belief.unmeasured import unmeasured_heights
+from mechsearch_jax.belief.unseen_motion import reopened, sweeps
+from mechsearch_jax.existence import allowances, closer_image, free, object_views, plainly_elsewhere, undetected
 from mechsearch_jax.geometry.bodies import with_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import grasp_hits, graspability, pairs
+from mechsearch_jax.images.measured import sampled
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import FoundGrasps, found_grasps, no_grasps
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.render import merge_windows
 from mechsearch_jax.workspace.target_view import body_at, main_body
 
 
@@ -33,6 +37,9 @@ class Belief(flax.struct.PyTreeNode):
       exists: f_t, shape (X,). It grows only where an action may have moved the target: see `update_belief`.
       found: c_t, whether the target has been seen and may still be where it was seen last.
       found_pose: that pose as x, y [m], yaw [rad].
+      measured: share of each pixel of f's coarse image that was measured in the last image, shape (h, w).
+      unmeasured: height up to which each cell of the board may be filled by a thing without depth [m], see
+        `unmeasured.unmeasured_heights`; -inf where it was seen that nothing is.
       allowed: how many coarse pixels the target may show at each place of its candidate poses while it is hidden, shape
         (X, S); see `existence.allowances`.
       grasps: the grasps of the found target that arm and shelf allow.
@@ -42,6 +49,8 @@ class Belief(flax.struct.PyTreeNode):
     exists: jax.Array
     found: jax.Array
     found_pose: jax.Array
+    measured: jax.Array
+    unmeasured: jax.Array
     allowed: jax.Array
     grasps: FoundGrasps
     restarts: jax.Array
@@ -50,11 +59,14 @@ class Belief(flax.struct.PyTreeNode):
 @kept()
 def initial_belief(problem: Problem) -> Belief:
     """The belief before the first observation: the target can be at every candidate pose."""
-    allowed = problem.config.existence.allowed(problem.camera)
+    config = problem.config.existence
+    allowed, coarse = config.allowed(problem.camera), problem.camera.scaled(config.step(problem.camera))
     return Belief(
         exists=jnp.ones(problem.poses.shape[0], bool),
         found=jnp.array(False),
         found_pose=jnp.zeros(3),
+        measured=jnp.ones((coarse.height, coarse.width)),
+        unmeasured=jnp.full([size + 2 * BORDER for size in problem.target.grid], jnp.inf),
         allowed=jnp.full(problem.existence.corner.shape[:2], allowed, jnp.int32),
         grasps=no_grasps(problem.target_grasps),
         restarts=jnp.int32(0),
@@ -76,8 +88,13 @@ def update_belief(
     more, and f is reset to what the present objects allow. One observation suffices for this, so that a detector that
     misses the target once, or a sensor that measures less than a third of it, costs one decision.
 
+    What was not measured (`Observation.measured`) shows nothing: f stays as it was there, and something without depth may
+    stand there (`Belief.unmeasured`), unless it was seen to be free and nothing was done since.
+
     If the action may have moved a hidden target, f is first reopened (`unseen_motion.reopened`). If f becomes empty
-    nevertheless, which is a contradiction, it is reset to what the present objects allow, and `restarts` counts it.
+    nevertheless, which is a contradiction, space that is hidden or not measured is opened again, and `restarts` counts
+    it: where the present objects allow the target, else where they hide it though their shapes reach into it. If there
+    is no such space, f stays empty: the target is probably not in the shelf.
 
     Args:
       problem: the constants.
@@ -95,9 +112,13 @@ def update_belief(
     settings, visible = problem.config.existence, jnp.asarray(observation.target_visible)
     tables, camera, target, objects = problem.existence, problem.camera, problem.target, observation.objects
     views = object_views(tables, camera, objects, everywhere, settings)
-    closer = closer_image(camera, objects, views, settings)
-    allowed = allowances(tables, camera, target, views, closer, settings)
-    now = existence(tables, camera, views, everywhere, allowed, settings)
+    step, closer_step, share = settings.step(camera), settings.closer_step(camera), observation.measured
+    measured = None if share is None else sampled(camera, share, step)
+    closer_measured = None if share is None else sampled(camera, share, closer_step)
+    closer = closer_image(camera, objects, views, settings, closer_measured)
+    allowed = allowances(tables, camera, target, views, closer, settings, measured)
+    unseen = undetected(tables, camera, views, everywhere, allowed, settings, measured)
+    now = jnp.any(unseen & free(views, everywhere), axis=-1)
     T_last = upright_pose(belief.found_pose, target.height(problem.shelf))
     lost = belief.found & ~visible & plainly_elsewhere(tables, camera, target, objects, closer, T_last, settings)
     # A lost target may be at any candidate pose: f was not updated while it counted as found.
@@ -108,13 +129,22 @@ def update_belief(
     both = exists & now
     found = (belief.found & ~lost) | visible
     contradiction = ~jnp.any(both) & ~found
-    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, prior), both)
+    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, jnp.any(unseen, axis=-1)), both)
+    if measured is None:
+        unmeasured = jnp.full_like(belief.unmeasured, -jnp.inf)
+    else:
+        unmeasured = unmeasured_heights(problem, measured, merge_windows(camera.scaled(step), views.windows))
+        # What was free at the last look is free, unless something was done since.
+        acted = jnp.array(False) if action is None else action.kind != ActionKind.NONE
+        unmeasured = jnp.where(acted, unmeasured, jnp.minimum(unmeasured, belief.unmeasured))
     pose = jnp.where(visible, observation.target_pose, belief.found_pose)
     T_world_target = problem.target_grasps.standing(pose)
     return Belief(
         exists=jnp.where(found, belief.exists, exists),
         found=found,
         found_pose=pose,
+        measured=jnp.ones_like(belief.measured) if measured is None else measured,
+        unmeasured=unmeasured,
         allowed=allowed,
         grasps=found_grasps(problem.target_grasps, T_world_target, found),
         restarts=belief.restarts + contradiction,
@@ -163,19 +193,39 @@ def possible_poses(
 
 
 def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
-    """Raster of the space that a hidden target may take; empty once it is found, when it is an ordinary obstacle."""
+    """Raster of the space that what was not seen may take; once the target is found, it is an ordinary obstacle."""
     if exists.shape[-1] == 0:
         # See `without_candidates`. No constant: XLA would compute with that as it compiles.
         grid = jnp.broadcast_to(jnp.int32(~belief.found), problem.target.grid)
     else:
         grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
+    top = problem.shelf.board + problem.target.tall
     return PossibleSpace(
-        occupied=widen(grid > 0),
+        target=jnp.where(bordered(widen(grid > 0), False), top, -jnp.inf),
+        unmeasured=belief.unmeasured,
         chance=grid / jnp.maximum(jnp.sum(grid), 1),
-        origin=problem.poses[0, :2],
+        origin=problem.poses[0, :2] - BORDER * problem.cell,
         cell=problem.cell,
-        top=jnp.float32(problem.shelf.board + problem.target.tall),
     )
+
+
+@kept()
+def sweeps_unmeasured(
+    problem: Problem, belief: Belief, before: Superquadrics, after: Superquadrics, action: Action
+) -> Bool[Array, ""]:
+    """Whether the hand, or what it moves, sweeps space in which something may stand that has no depth.
+
+    Args:
+      problem, belief: constants of the search, and the belief after the last look.
+      before, after: the recognised objects, and where the action is predicted to leave them, in the same slots.
+      action: a single action.
+    """
+    space = possible_space(problem, belief, belief.exists)
+    entered = [
+        jnp.any(sweep.counts & enters_unmeasured(space, sweep.points))
+        for sweep in sweeps(problem, before, after, action)
+    ]
+    return jnp.any(jnp.stack(entered)) & (action.kind != ActionKind.NONE)
 
 
 def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Superquadrics, Bool[Array, " n"]]:

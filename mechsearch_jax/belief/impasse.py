@@ -28,6 +28,8 @@ def _movable(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[
 
 def impasse(problem: Problem, belief: Belief, objects: Superquadrics) -> str:
     """Why no action is possible, in one line; `objects` are those recognised, without the target. Not for `jit`."""
+    if not bool(belief.found) and not bool(jnp.any(belief.exists)):
+        return "every place where it could stand was seen without it; it is probably not in this shelf"
     count = int(jnp.sum(objects.valid))
     if count == 0:
         return "nothing that could be moved is recognised on the shelf"

@@ -58,8 +58,10 @@ def reopened(
     now = jnp.any(exists.reshape(-1, target.yaws), axis=1)
     distance2 = jnp.sum((places[:, None] - places[None]) ** 2, axis=-1)
     opened = jnp.zeros_like(now)
-    for sweep in _sweeps(problem, before, after, action):
-        swept = jnp.where((sweep.counts & (action.kind != ActionKind.NONE))[:, None], sweep.points[:, :2], jnp.inf)
+    for sweep in sweeps(problem, before, after, action):
+        low = sweep.points[:, 2] < problem.shelf.board + target.tall
+        counts = sweep.counts & low & (action.kind != ActionKind.NONE)
+        swept = jnp.where(counts[:, None], sweep.points[:, :2], jnp.inf)
         gap2 = jnp.min(jnp.sum((places[:, None] - swept[None]) ** 2, axis=-1), axis=1)
         beside = gap2 < (radius + REACH) ** 2
         within = distance2 < (sweep.travel + 2 * REACH) ** 2
@@ -70,12 +72,12 @@ def reopened(
     return jnp.repeat(opened, target.yaws)
 
 
-class _Sweep(NamedTuple):
+class Sweep(NamedTuple):
     """The space that one stretch of an action swept.
 
     Attributes:
       points: of the hand and the objects on their way, shape (P, 3) [m].
-      counts: which points are low enough to touch the target, shape (P,).
+      counts: which points are swept, shape (P,).
       heading: direction of motion from above, shape (2,); 0 if unknown.
       travel: how far the target can have been taken [m].
     """
@@ -86,14 +88,15 @@ class _Sweep(NamedTuple):
     travel: Array | float
 
 
-def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, action: Action) -> tuple[_Sweep, ...]:
+def sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, action: Action) -> tuple[Sweep, ...]:
     """The stretches of an action: the way in, the push with the objects it moved, the way out, the way to a new place.
 
     The first pose of a moving object is left out, for it moves away from what touches it there.
     """
-    n, shelf, approach = before.capacity, problem.shelf, problem.gripper.approach
+    n, approach = before.capacity, problem.gripper.approach
     holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
-    is_acted_on = (jnp.arange(n) == action.object) & before.valid
+    takes = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.takes_target]))
+    is_acted_on = (jnp.arange(n) == action.object) & before.valid & ~takes
     carry = compose(action.T_world_place, inverse(action.T_world_gripper))
     planned = jnp.where(holds, transform(carry, before.position), before.position + action.displacement[None])
     same, matched = same_objects(before, after, jnp.where(is_acted_on[:, None], planned, before.position))
@@ -130,7 +133,7 @@ def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, actio
     def sweep(parts, heading, travel):
         points = jnp.concatenate([points.reshape(-1, 3) for points, _ in parts])
         counts = jnp.concatenate([jnp.broadcast_to(c, p.shape[:-1]).reshape(-1) for p, c in parts])
-        return _Sweep(points, counts & (points[:, 2] < shelf.board + problem.target.tall), heading, travel)
+        return Sweep(points, counts, heading, travel)
 
     return (
         sweep([(hand_in, True)], forward, ways),

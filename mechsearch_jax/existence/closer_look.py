@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.existence.config import ExistenceConfig
-from mechsearch_jax.existence.function import in_window, shown_pixels
+from mechsearch_jax.existence.function import free, in_window, measured_of_target, shown_pixels
 from mechsearch_jax.existence.tables import ExistenceTables
 from mechsearch_jax.existence.views import ObjectViews, object_windows
 from mechsearch_jax.geometry import superquadric
@@ -18,6 +18,7 @@ from mechsearch_jax.geometry.bodies import enlarged, slimmed, world_parts
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, transform
+from mechsearch_jax.images.measured import veiled
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
@@ -49,11 +50,13 @@ def allowances(
     views: ObjectViews,
     closer: Float[Array, "h w"],
     config: ExistenceConfig,
+    measured: Float[Array, "a b"] | None = None,
 ) -> Int[Array, "x s"]:
     """How many coarse pixels a hidden target may show at each place.
 
     By default the detector's threshold; more if no place of a pose shows so few pixels, but a closer look at the
-    present scene shows that the target is hidden.
+    present scene shows that the target is hidden; and more where only a part of its pixels would be measured, since the
+    detector counts measured ones.
 
     Args:
       tables: constants of the problem.
@@ -62,22 +65,26 @@ def allowances(
       views: of the objects that the camera sees.
       closer: image of `closer_image`.
       config: static.
+      measured: as of `existence`.
     """
-    least = config.allowed(camera)
-    bound = jnp.full(tables.corner.shape[:2], least, jnp.int32)
+    coarse, everywhere = camera.scaled(config.step(camera)), jnp.ones(tables.corner.shape[0], bool)
+    seen: Float[Array, "x s"] | float = 1.0
+    bound = jnp.full(tables.corner.shape[:2], config.allowed(camera), jnp.int32)
+    if measured is not None:
+        seen = measured_of_target(tables, coarse, measured, everywhere)
+        unseen = found_pixels(camera, config.found_pixels) / config.step(camera) ** 2
+        bound = jnp.floor(unseen / seen).astype(jnp.int32)
     if config.criterion != "detector" or not config.closer_look:
         return bound
-    everywhere = jnp.ones(tables.corner.shape[0], bool)
-    coarse = camera.scaled(config.step(camera))
-    image = render.merge_windows(coarse, views.windows)
+    image = veiled(render.merge_windows(coarse, views.windows), measured)
     shown = shown_pixels(tables, coarse, image, everywhere)
-    free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
-    settled = jnp.any(free & (shown <= least), axis=1)
-    doubtful = free & ~settled[:, None] & (shown > least) & (shown <= DOUBTFUL)
+    is_free = free(views, everywhere)
+    settled = jnp.any(is_free & (shown <= bound), axis=1)
+    doubtful = is_free & ~settled[:, None] & (shown > bound) & (shown <= DOUBTFUL)
     order = jnp.argsort(jnp.where(doubtful, shown, DOUBTFUL + 1), axis=1, stable=True)
     doubtful &= jnp.argsort(order, axis=1) < CLOSER_PLACES
     counted = _counted(tables, camera, target, closer, doubtful, config)
-    hidden = doubtful & (counted <= CLOSER_TOLERANCE * found_pixels(camera, config.found_pixels))
+    hidden = doubtful & (counted * seen <= CLOSER_TOLERANCE * found_pixels(camera, config.found_pixels))
     return jnp.where(hidden, shown, bound)
 
 
@@ -100,7 +107,11 @@ def _counted(
 
 
 def closer_image(
-    camera: Camera, scene: Superquadrics, views: ObjectViews, config: ExistenceConfig
+    camera: Camera,
+    scene: Superquadrics,
+    views: ObjectViews,
+    config: ExistenceConfig,
+    measured: Float[Array, "a b"] | None = None,
 ) -> Float[Array, "h w"]:
     """The depth image of a closer look [m]; the coarse image if the configuration has no closer look.
 
@@ -109,14 +120,15 @@ def closer_image(
       scene: the objects that the camera sees, fields (N, ...).
       views: of them.
       config: static.
+      measured: share of each pixel of the closer image that was measured; None if everything was.
     """
     scale, step = config.closer_step(camera), config.step(camera)
     closer, grown = camera.scaled(scale), step / scale
     if scale == step:
-        return render.merge_windows(closer, views.windows)
+        return veiled(render.merge_windows(closer, views.windows), measured)
     window = math.ceil(config.window[0] * grown), math.ceil(config.window[1] * grown)
     windows = object_windows(closer, enlarged(scene, ROUNDED), scene.valid, window, block=1)
-    return render.merge_windows(closer, windows)
+    return veiled(render.merge_windows(closer, windows), measured)
 
 
 def _pixels(

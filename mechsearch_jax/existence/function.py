@@ -13,6 +13,7 @@ from mechsearch_jax.existence.config import ExistenceConfig
 from mechsearch_jax.existence.tables import ExistenceTables
 from mechsearch_jax.existence.views import ObjectViews
 from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.images.measured import unmeasured, veiled
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 
@@ -27,6 +28,7 @@ def existence(
     exists: Bool[Array, " x"],
     allowed: Int[Array, "x s"],
     config: ExistenceConfig,
+    measured: Float[Array, "h w"] | None = None,
 ) -> Bool[Array, " x"]:
     """`f_t` from `f_{t-1}` and the views of the objects (equation 4 with c = 0): it can only shrink.
 
@@ -37,19 +39,39 @@ def existence(
       exists: `f_{t-1}`; all True at the start.
       allowed: how many coarse pixels a hidden target may show, see `allowances`.
       config: static.
+      measured: share of each pixel of the coarse image that was measured; None if everything was. What was not measured
+        shows nothing, and so rules nothing out.
 
     Returns:
       Where the target can be.
     """
+    return exists & jnp.any(
+        undetected(tables, camera, views, exists, allowed, config, measured) & free(views, exists), axis=-1
+    )
+
+
+def undetected(
+    tables: ExistenceTables,
+    camera: Camera,
+    views: ObjectViews,
+    exists: Bool[Array, " x"],
+    allowed: Int[Array, "x s"],
+    config: ExistenceConfig,
+    measured: Float[Array, "h w"] | None = None,
+) -> Bool[Array, "x s"]:
+    """At which places of the poses where `exists` the target would not be detected; arguments as of `existence`."""
     coarse = camera.scaled(config.step(camera))
-    image = render.merge_windows(coarse, views.windows)
+    image = veiled(render.merge_windows(coarse, views.windows), measured)
     if config.criterion == "detector":
-        possible = shown_pixels(tables, coarse, image, exists) <= allowed
-    else:
-        possible = _alike(tables, coarse, image, exists, config)
-    if views.collides is not None:
-        possible &= ~jnp.any(views.collides, axis=-1)
-    return exists & jnp.any(possible, axis=-1)
+        return shown_pixels(tables, coarse, image, exists) <= allowed
+    return _alike(tables, coarse, image, exists, config)
+
+
+def free(views: ObjectViews, exists: Bool[Array, " x"]) -> Bool[Array, "x #s"]:
+    """At which places the target meets no object: at all of them if collisions do not count."""
+    if views.collides is None:
+        return jnp.ones((exists.shape[0], 1), bool)
+    return ~jnp.any(views.collides, axis=-1)
 
 
 def _at_places(
@@ -101,6 +123,23 @@ def shown_pixels(
         return jnp.sum(inside & (depth < behind))
 
     return _at_places(tables, coarse, image, exists, shown)
+
+
+def measured_of_target(
+    tables: ExistenceTables, coarse: Camera, measured: Float[Array, "h w"], exists: Bool[Array, " x"]
+) -> Float[Array, "x s"]:
+    """The share of its measured pixels' area that was measured of the target at each place of the poses where `exists`.
+
+    Pixels that were mostly not measured are left out; 1 if no other is left.
+    """
+
+    def share(depth, behind, inside):
+        counts = inside & jnp.isfinite(depth) & ~unmeasured(behind)
+        total = jnp.sum(counts)
+        return jnp.where(total > 0, jnp.sum(jnp.where(counts, behind, 0.0)) / jnp.maximum(total, 1), 1.0)
+
+    at_places = _at_places(tables, coarse, measured, exists, share)
+    return jnp.where(exists[:, None], at_places, 1.0)
 
 
 def _alike(

@@ -20,6 +20,7 @@ from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thi
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
@@ -188,13 +189,14 @@ class Recogniser:
         Raises:
           InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
-        fitted, visible = self.fitted(key, depth, colour, mask, target_id)
-        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence)
+        fitted, visible, measured = self.fitted(key, depth, colour, mask, target_id)
+        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, measured)
 
     def fitted(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
-    ) -> tuple[Fitted, Bool[Array, ""]]:
-        """What was made of the view of the images, with the pixels of each object, and whether the target is visible.
+    ) -> tuple[Fitted, Bool[Array, ""], Float[Array, "rows columns"]]:
+        """What was made of the view of the images, with the pixels of each object; whether the target is visible; and
+        the share of the full image that was measured, see `images.measured.measured_share`.
 
         Args:
           key, depth, colour, mask, target_id: as above.
@@ -204,11 +206,11 @@ class Recogniser:
         """
         check_images(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
-        image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
+        image, visible, measured = _labelled(self, keys[0], depth, colour, mask, target_id)
         fitter = self.fitter if mask is None else self.mask_fitter
         settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
         unseen = found_pixels(self.camera) / self.view.stride**2
-        return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible
+        return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible, measured
 
 
 def _as_pytree(slot: Any) -> Any:
@@ -219,8 +221,8 @@ def _as_pytree(slot: Any) -> Any:
 @kept()
 def _labelled(
     recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
-) -> tuple[LabelledImage, Bool[Array, ""]]:
-    """The shelf's part of the image with labels, and whether the target is visible in it."""
+) -> tuple[LabelledImage, Bool[Array, ""], Float[Array, "rows columns"]]:
+    """The shelf's part of the image with labels, whether the target is visible in it, and what of it was measured."""
     camera, view, shelf = recogniser.camera, recogniser.view, recogniser.shelf
     seen = view.of(jnp.asarray(depth, jnp.float32))
     seen = jnp.where(seen > 0.0, seen, jnp.nan)
@@ -252,7 +254,8 @@ def _labelled(
         labels = _labels(instances, freed, shelf, points)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
         visible = (jnp.sum(of_target) > threshold).astype(bool)
-    return LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible), visible
+    image = LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible)
+    return image, visible, measured_share(camera, view, seen)
 
 
 def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:

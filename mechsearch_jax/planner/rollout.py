@@ -88,7 +88,8 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
         candidates=no_candidates(problem.space, scene.capacity),
         moved=scene.valid,
         available=scene.valid & (~is_target | config.move_target),
-        alive=jnp.array(True),
+        # Where the target can be nowhere, no action has an aim.
+        alive=belief.found | jnp.any(belief.exists),
     )
 
 
@@ -129,7 +130,8 @@ class Rollout:
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
         )
         here = jnp.where(self.belief.found, state.target_at, state.exists)
-        exists = existence(problem.existence, problem.camera, views, here, self.belief.allowed, settings)
+        belief = self.belief
+        exists = existence(problem.existence, problem.camera, views, here, belief.allowed, settings, belief.measured)
         at_candidate_poses, at_found_pose = split_found(
             self.objective.needs_graspability(self.belief, state.replace(exists=exists))
         )
@@ -196,7 +198,9 @@ class Rollout:
         return changes, action, self.config.unseen_contact_penalty * self.contact_probability(state, sample)
 
     def contact_probability(self, state: State, sample: Sample) -> Float[Array, ""]:
-        """Share of the possible poses at which an action would touch the target, in the scene where it was drawn."""
+        """Share of the possible poses at which an action would touch the target, where it was drawn; 1 if it enters
+        space that was not measured.
+        """
         possible = possible_space(self.problem, self.belief, state.exists)
         scene = self.drawn_in(self.present, state).scene
         return contact_probability(self.problem.space, scene, possible, sample)

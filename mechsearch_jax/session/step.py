@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.belief.belief import Belief, graspability_map
+from mechsearch_jax.belief.belief import Belief, graspability_map, sweeps_unmeasured
 from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
@@ -27,6 +27,12 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.step_json import step_json
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
+
+# Why no motion is made that would sweep space in which something may stand that has no depth.
+UNMEASURED = (
+    "on its way the hand, or what it moves, enters space of which nothing was measured: a thing without depth (black, "
+    "shiny, transparent) may stand there; look from elsewhere, or light it otherwise"
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -147,6 +153,8 @@ def motion_of(
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
     verb = kind.describe(decision.action, observation.objects.capacity)
+    if sweeps_unmeasured(problem, belief, observation.objects, decision.predicted, decision.action):
+        return Motion(nothing, f"{target}; to {verb} is not possible: {UNMEASURED}", None, blocked=True)
     try:
         check_recognition(problem, observation, depth, config.doubt)
     except InputError as error:

@@ -1,0 +1,80 @@
+"""Which part of a depth image was measured: only a pixel that was says what is not there.
+
+Black, shiny and transparent things, the shadows of a stereo camera and mirrors have no depth: what is there is not known.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.images.cloud import View
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import longer
+
+# How much coarser than an image of 1280 x 720 shares are counted; with other images scaled like f's own image.
+DOWNSCALE = 7
+# Pixels of which less than this share was measured count as not measured.
+MOSTLY = 0.5
+
+
+def share_step(camera: Camera) -> int:
+    """Side of the blocks of pixels in which `measured_share` counts, in pixels of a camera's image."""
+    return max(round(DOWNSCALE * longer(camera)), 1)
+
+
+def measured_share(camera: Camera, view: View, depth: Float[Array, "h w"]) -> Float[Array, "rows columns"]:
+    """The share of the pixels of each block of a camera's image that was measured, from a view of the image.
+
+    Blocks in which the view has no ray take the nearest ray's. The size is that of `camera.scaled(share_step(camera))`.
+
+    Args:
+      camera: of the full image.
+      view: the rays of it that `depth` has.
+      depth: along the camera's z [m]; NaN or 0 where nothing was measured, infinite where nothing is.
+    """
+    step = share_step(camera)
+    measured = (depth > 0.0).astype(jnp.float32)
+    rows, columns = camera.height // step, camera.width // step
+    at_rows, near_rows = _blocks(rows, step, view.row, view.stride, depth.shape[0])
+    at_columns, near_columns = _blocks(columns, step, view.column, view.stride, depth.shape[1])
+    seen = jnp.matmul(jnp.matmul(at_rows, measured, precision="highest"), at_columns.T, precision="highest")
+    count = jnp.sum(at_rows, axis=1)[:, None] * jnp.sum(at_columns, axis=1)[None]
+    return jnp.where(count > 0.0, seen / jnp.maximum(count, 1.0), measured[near_rows][:, near_columns])
+
+
+def _blocks(
+    count: int, step: int, first: int, stride: int, rays: int
+) -> tuple[Float[Array, "count rays"], Int[Array, " count"]]:
+    """Which of the rays along an axis lie in each block, as ones, and the ray nearest to each block's middle."""
+    block = (first + stride * jnp.arange(rays)) // step
+    members = (block[None] == jnp.arange(count)[:, None]).astype(jnp.float32)
+    middle = jnp.arange(count) * step + step // 2
+    return members, jnp.clip((middle - first + stride // 2) // stride, 0, rays - 1)
+
+
+def sampled(camera: Camera, share: Float[Array, "h w"], step: int) -> Float[Array, "rows columns"]:
+    """`measured_share` at the resolution of `camera.scaled(step)`: that of the block around each pixel's middle."""
+    own = share_step(camera)
+    if step == own:
+        return share
+    rows, columns = (
+        jnp.minimum((jnp.arange(size // step) * step + step // 2) // own, blocks - 1)
+        for size, blocks in zip((camera.height, camera.width), share.shape, strict=True)
+    )
+    return share[rows][:, columns]
+
+
+def veiled(image: Float[Array, "h w"], share: Float[Array, "h w"] | None) -> Float[Array, "h w"]:
+    """A depth image in which pixels that were mostly not measured hide whatever is there, as if by a thing at the lens.
+
+    Args:
+      image: of the recognised bodies [m].
+      share: as `sampled` at the image's resolution; None where everything was measured.
+    """
+    return image if share is None else jnp.where(unmeasured(share), 0.0, image)
+
+
+def unmeasured(share: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
+    """Which pixels were mostly not measured."""
+    return share < MOSTLY
