@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
 from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
-from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
 from mechsearch_jax.benchmarks.store.rows import EVENTS, Row, write_rows
 from mechsearch_jax.runtime.errors import InputError
 
@@ -113,7 +113,7 @@ def test_a_report_of_one_success_has_no_failures(tmp_path):
 
 KNOWN = {
     **dict.fromkeys(EVENTS, 0),
-    **{"looks": 4, "truth_lost_step": None, "fallen_step": None},
+    **{"looks": 4, "truth_lost_step": None, "fallen_step": None, "truth_ruled_out_step": None},
 }
 
 
@@ -129,7 +129,7 @@ def test_a_report_says_what_happened_on_the_way(tmp_path):
     ]
     write_report(rows, tmp_path)
     text = page_of(tmp_path)
-    assert "| search-for-grasp | all | 2 | 0.500 | 0.375 | 0.000 | 0.500 | 0.000 | 0.000 |" in text
+    assert "| search-for-grasp | all | 2 | 0.500 | 0.375 | 0.000 | 0.000 | 0.500 | 0.000 | 0.000 |" in text
     with open(tmp_path / "events.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [(line["objects"], line["episodes"], line["fallen"]) for line in lines] == [
@@ -139,6 +139,8 @@ def test_a_report_says_what_happened_on_the_way(tmp_path):
     assert json.loads((tmp_path / "rates.json").read_text())["events"][1]["truth_lost"] == 0.5
     assert report.failures(rows) == [report.Failures("search-for-grasp", fell, 2, 2 / 3)]
     assert events_table(rows).row_count == 2
+    unknown = [dataclasses.replace(row, truth_ruled_out=None) for row in rows]
+    assert [events.texts()[2] for events in summarise_events(unknown)] == ["", ""]
 
 
 def test_rows_of_earlier_versions_have_no_events(tmp_path):

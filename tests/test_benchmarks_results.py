@@ -22,6 +22,7 @@ from mechsearch_jax.benchmarks.store.rows import (
     configuration,
     episode_key,
     identity,
+    parse_row,
     read_rows,
     write_rows,
 )
@@ -81,17 +82,20 @@ def test_an_episode_is_read_back(tmp_path):
 def test_what_happened_on_the_way_is_read_back_and_counted(tmp_path):
     before, after = STEPS
     calm = dataclasses.replace(before, truth_possible=True, restarts=0, fallen=(), held_up=False, at_rest=True)
+    calm = dataclasses.replace(calm, around_possible=True)
     steps = (
         calm,
         dataclasses.replace(calm, truth_possible=False, restarts=1, fallen=(1, 0), held_up=True, at_rest=False),
-        dataclasses.replace(calm, truth_possible=False, restarts=1, target_fallen=True, tracking_error=0.25),
+        dataclasses.replace(
+            calm, truth_possible=False, around_possible=False, restarts=1, target_fallen=True, tracking_error=0.25
+        ),
         dataclasses.replace(after, restarts=1),
     )
     save_episode(dataclasses.replace(EPISODE, steps=steps), tmp_path / "episode.json")
     episode = load_episode(tmp_path / "episode.json")
     assert episode.steps == steps
     row = Row.of_episode(episode)
-    assert [getattr(row, name) for name in EVENTS] == [3, 2, 1, 1, 2, 2, 1, 1]
+    assert [getattr(row, name) for name in EVENTS] == [3, 2, 1, 1, 2, 2, 1, 1, 1, 2]
     unknown = Row.of_episode(dataclasses.replace(episode, steps=()))
     assert [getattr(unknown, name) for name in EVENTS] == [None] * len(EVENTS)
 
@@ -261,6 +265,15 @@ def test_a_row_says_what_ran_it_and_how_long_compiling_took():
     row = Row.of_episode(dataclasses.replace(EPISODE, steps=steps, versions=versions), "this code")
     assert (row.planning_seconds, row.simulation_seconds, row.compile_seconds) == (0.75, 1.0, 22.0)
     assert (row.code, row.device, json.loads(row.versions)) == ("this code", "cpu: cpu", {"jax": "1.2.3"})
+
+
+def test_a_table_without_the_later_columns_says_nothing_of_them(tmp_path):
+    write_rows([dataclasses.replace(ROW, truth_ruled_out=1, truth_ruled_out_step=0)], tmp_path / "rows.parquet")
+    table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
+    before = table.drop_columns(["truth_ruled_out", "truth_ruled_out_step"])
+    pyarrow.parquet.write_table(before, tmp_path / "before.parquet")
+    assert read_rows(tmp_path / "before.parquet") == [ROW]
+    assert parse_row(json.dumps(before.to_pylist()[0])) == ROW
 
 
 def test_what_is_no_table_of_episodes_is_one_line(tmp_path):

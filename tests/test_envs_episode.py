@@ -28,13 +28,22 @@ from stage import (
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle, truth_of, truth_unseen
+from mechsearch_jax.envs.camera.snapshot import (
+    Snapshot,
+    informed,
+    nearest_bodies,
+    oracle,
+    true_target_pose,
+    truth_of,
+    truth_unseen,
+)
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.numbering import named_observation
 from mechsearch_jax.envs.episode.protocols import WithTruePose
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
+from mechsearch_jax.envs.episode.slots import sizes_and_truths
 from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
 from mechsearch_jax.envs.recording.pictures import frame
 from mechsearch_jax.envs.simulators.native import NativeSimulator
@@ -416,13 +425,30 @@ def test_every_step_says_whether_the_truth_is_possible(problem):
 
     episode = run(problem, HIDDEN, stage, recogniser=blind)
     assert [step.truth_possible for step in episode.steps] == [True, False, False]
+    assert [step.around_possible for step in episode.steps] == [True, False, False]
     assert [step.restarts for step in episode.steps] == [0, 0, 0]
     row = Row.of_episode(dataclasses.replace(episode, config={**METHOD, **episode.config}))
     assert (row.looks, row.truth_lost, row.truth_lost_step, row.restarts) == (3, 2, 1, 0)
+    assert (row.truth_ruled_out, row.truth_ruled_out_step) == (2, 1)
     episode = run(problem, HIDDEN, Stage(reveal))
     assert [step.truth_possible for step in episode.steps] == [True, None]
     tipped = run(problem, HIDDEN, Stage(lambda world: reveal(topple(world))), recogniser=blind)
     assert [step.truth_possible for step in tipped.steps] == [True, None, None]
+    assert [step.around_possible for step in tipped.steps] == [True, None, None]
+
+
+@pytest.mark.parametrize(("cells", "yaw", "around"), [((0, 0), 3, True), ((1, -1), 2, True), ((0, 2), 0, False)])
+def test_the_truth_is_ruled_out_where_no_cell_around_it_is_possible(problem, cells, yaw, around):
+    world = jax.tree.map(lambda a: a[None], from_scenario(HIDDEN))
+    size, grid, yaws = problem.poses.shape[0], problem.target.grid, problem.target.yaws
+    truth = int(nearest_candidate(problem.poses, true_target_pose(from_scenario(HIDDEN)), problem.target.turn))
+    row, column = np.add(np.divmod(truth // yaws, grid[1]), cells)
+    exists = np.zeros((1, size), bool)
+    exists[0, (row * grid[1] + column) * yaws + yaw % yaws] = True
+    # The first and the last cell are no neighbours of one another.
+    exists[0, :yaws] = True
+    sizes, _, possible = sizes_and_truths(problem, jnp.asarray(exists), world)
+    assert (int(sizes[0]), bool(possible[0])) == (1 + yaws, around)
 
 
 def test_an_f_that_becomes_empty_is_counted(problem):

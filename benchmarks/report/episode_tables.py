@@ -137,7 +137,7 @@ def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
         table.add_row(
             *_group(events.group, key),
             str(events.episodes),
-            *(f"{getattr(events, name):.3f}" for name in EVENTS),
+            *events.texts(),
             style="bold" if events.objects is None else None,
         )
     return table

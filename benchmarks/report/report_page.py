@@ -214,7 +214,8 @@ def _events(report: Report) -> list[Block]:
         return [Paragraph("These episodes do not say: they ended in errors.")]
     explanation = Paragraph(
         "Shares of the episodes that say so; *of all looks* is the share of the steps before the target was found at "
-        "which f ruled out its true pose."
+        "which f ruled out its true pose; *around it, too* is the share of the episodes in which it also ruled out the "
+        "cells of the grid around it."
     )
 
     def table(events: Sequence[Events]) -> Table:
@@ -222,7 +223,7 @@ def _events(report: Report) -> list[Block]:
             (
                 *map(report.key.text, group.group.values()),
                 group.episodes,
-                *(f"{getattr(group, name):.3f}" for name in EVENTS),
+                *group.texts(),
             )
             for group in events
         ]

@@ -16,6 +16,7 @@ from mechsearch_jax.benchmarks.store.rows import Row
 EVENTS = {
     "truth_lost": "truth ruled out",
     "looks_truth_lost": "of all looks",
+    "truth_ruled_out": "around it, too",
     "restarted": "f started anew",
     "fallen": "objects fallen",
     "held_up": "arm held up",
@@ -89,6 +90,8 @@ class Events:
       episodes: how many episodes say so.
       truth_lost: share of them in which f ruled out the target's true pose at some step.
       looks_truth_lost: share of all steps before the target was found at which it did.
+      truth_ruled_out: share of the episodes in which it ruled out the true pose's cell and all cells around it at some
+        step; None where an episode does not say.
       restarted: share of the episodes in which f became empty and was started anew.
       fallen: in which an object left the board.
       held_up: in which the arm was held up.
@@ -99,6 +102,7 @@ class Events:
     episodes: int
     truth_lost: float
     looks_truth_lost: float
+    truth_ruled_out: float | None
     restarted: float
     fallen: float
     held_up: float
@@ -108,6 +112,11 @@ class Events:
     def objects(self) -> Hashable:
         """The number of surrounding objects; None for all."""
         return self.group.get("objects")
+
+    def texts(self) -> list[str]:
+        """The shares `EVENTS`, in the words of tables; empty where one is not known."""
+        shares = [getattr(self, name) for name in EVENTS]
+        return ["" if share is None else f"{share:.3f}" for share in shares]
 
 
 def step_of(row: Row, goal: str) -> int | None:
@@ -207,6 +216,7 @@ def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "ob
                 episodes=len(recorded),
                 truth_lost=share("truth_lost"),
                 looks_truth_lost=lost / max(looks, 1),
+                truth_ruled_out=None if any(r.truth_ruled_out is None for r in recorded) else share("truth_ruled_out"),
                 restarted=share("restarts"),
                 fallen=share("objects_fallen"),
                 held_up=share("held_up"),

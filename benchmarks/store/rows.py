@@ -32,7 +32,10 @@ KEY_DIGITS = 32
 EVENTS = (
     *("looks", "truth_lost", "truth_lost_step", "restarts"),
     *("objects_fallen", "fallen_step", "held_up", "unsettled"),
+    *("truth_ruled_out", "truth_ruled_out_step"),
 )
+# Columns that tables of before do not have; they say nothing of it.
+_LATER = frozenset(("truth_ruled_out", "truth_ruled_out_step"))
 # How the reason begins where the program failed, not the robot.
 ERROR = "error: "
 # Between kinds of action in their column.
@@ -89,9 +92,12 @@ class Row:
       code: what ran it, as `evaluate.present_code` says it.
       device: that computed it, as `versions` says it.
       versions: of Python and the libraries, and the machine, as JSON.
+      truth_ruled_out: at how many of the `looks` f ruled out every candidate pose of the true pose's cell and of the
+        eight cells around it; None where that is not known.
+      truth_ruled_out_step: number of actions before the first of these; None where there was none.
 
-    From `looks` to `unsettled`, `compile_seconds`, `device` and `versions` are None for an episode that could not be
-    run to its end.
+    From `looks` to `unsettled`, `compile_seconds`, `device`, `versions` and the last two are None for an episode that
+    could not be run to its end.
     """
 
     scenario: str
@@ -127,6 +133,8 @@ class Row:
     code: str = ""
     device: str | None = None
     versions: str | None = None
+    truth_ruled_out: int | None = None
+    truth_ruled_out_step: int | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode, code: str = "") -> Row:
@@ -184,6 +192,7 @@ def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
     if not steps:
         return dict.fromkeys(EVENTS)
     lost = [i for i, step in enumerate(steps) if step.truth_possible is False]
+    ruled_out = [i for i, step in enumerate(steps) if step.around_possible is False]
     fell = [i + 1 for i, step in enumerate(steps) if step.fallen]
     return {
         "looks": sum(step.truth_possible is not None for step in steps),
@@ -194,6 +203,8 @@ def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
         "fallen_step": min(fell, default=None),
         "held_up": sum(bool(step.held_up) for step in steps),
         "unsettled": sum(step.at_rest is False for step in steps),
+        "truth_ruled_out": len(ruled_out),
+        "truth_ruled_out_step": min(ruled_out, default=None),
     }
 
 
@@ -303,13 +314,13 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
-    missing = _FIELDS.keys() - set(table.schema.names)
+    missing = _FIELDS.keys() - _LATER - set(table.schema.names)
     if missing:
         raise InputError(
             f"{path}: lacks the column {min(missing)}: it is no table of episodes of this version; use another file"
         )
     try:
-        columns = table.select(list(_FIELDS)).to_pydict()
+        columns = table.select([name for name in _FIELDS if name in table.schema.names]).to_pydict()
         return [_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
     except ValueError as error:
         raise InputError(f"{path}: {error}; use another file") from error
@@ -324,10 +335,10 @@ def parse_row(text: str | bytes) -> Row:
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("it is not a JSON object")
-    missing = _FIELDS.keys() - value.keys()
+    missing = _FIELDS.keys() - _LATER - value.keys()
     if missing:
         raise ValueError(f"it lacks {min(missing)}")
-    return _row({name: value[name] for name in _FIELDS})
+    return _row({name: value[name] for name in _FIELDS if name in value})
 
 
 def _row(fields: dict[str, Any]) -> Row:

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing, drawn_appearance, scene_key, sensed_colour
-from mechsearch_jax.envs.camera.sensing import Sensing, true_camera
+from mechsearch_jax.envs.camera.sensing import Sensing, sensed_depth, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import Image, observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
@@ -98,9 +98,13 @@ class ImageRecogniser:
         view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
         image = labelled(keys[0], self, view, shelf, snapshot.world, snapshot.target_seen, snapshot.sensing)
+        seen = snapshot.target_seen
+        if snapshot.sensing is not None and snapshot.sensing.holes is not None:
+            seen &= jnp.sum(image.of_target) > found_pixels(snapshot.camera) / view.stride**2
+            image = image.replace(of_target=image.of_target & seen)
         shapes = ShapeNetwork.of(self.weights)
         fitted = self.fitter(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
-        return Observation(fitted.objects, snapshot.target_seen, fitted.target_pose, fitted.confidence)
+        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence)
 
 
 @kept(static_argnames=("recogniser",))
@@ -126,7 +130,7 @@ def labelled(
     """
     image = observe(true_camera(view.camera, sensing), world, shelf)
     noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
-    points = noise(key, view.camera, image.depth)
+    points = noise(key, view.camera, sensed_depth(view.camera, world, image, sensing))
     masks = true_labels(points, image.segmentation, shelf)
     # Where the true image shows nothing is marked, as in true masks.
     depth = measured_depth(view.camera, image.depth, points)
@@ -206,7 +210,7 @@ def sighted(
     appearance = drawn_appearance(scene_key(world), recogniser.detector.rgb, camera.hue_gap)
     image = observe(true_camera(view.camera, sensing), world, shelf, appearance)
     noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
-    points = noise(key, view.camera, image.depth)
+    points = noise(key, view.camera, sensed_depth(view.camera, world, image, sensing))
     depth = depth_of(view.camera, points)
     # The noise of the depth takes 0 to 2 of this key, see `OtherNoise`.
     colour = sensed_colour(jax.random.fold_in(key, 3), image.colour, camera)

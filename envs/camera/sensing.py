@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing
+from mechsearch_jax.envs.camera.holes import HOLES, DrawnHoles
+from mechsearch_jax.envs.camera.simulated_camera import Image
 from mechsearch_jax.envs.world.mismatch import ActualCell, Mismatch
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.geometry.footprints import extents
@@ -64,17 +66,19 @@ class Sensing(flax.struct.PyTreeNode):
       noise: of the depth; None for the recogniser's.
       colour: of the colour image; None for the recogniser's.
       sizes: factors on the objects' true half-extents along their own axes, shape (..., 8, 3); None for none.
+      holes: of the depth; None for none.
     """
 
     place: Place | None = None
     noise: OtherNoise | None = None
     colour: ColourSensing | None = None
     sizes: jax.Array | np.ndarray | None = None
+    holes: DrawnHoles | None = None
 
 
 def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
     """The sensing of an episode, as NumPy arrays; None if it is as the planner assumes."""
-    place, noise, colour, sizes = None, None, None, None
+    place, noise, colour, sizes, holes = None, None, None, None, None
     if mismatch.moves_camera:
         T_base_world = np.linalg.inv(cell.T_world_base)
         T_seen_world = np.linalg.inv(cell.T_base_moved) @ T_base_world
@@ -86,7 +90,9 @@ def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
         colour = ColourSensing(*(np.asarray(n, np.float32) for n in numbers))
     if mismatch.resizes:
         sizes = np.asarray(cell.seen_size[:TARGET], np.float32)
-    parts = place, noise, colour, sizes
+    if mismatch.holes != "none":
+        holes = DrawnHoles(np.uint32(cell.holes_seed), HOLES[mismatch.holes])
+    parts = place, noise, colour, sizes, holes
     return None if all(part is None for part in parts) else Sensing(*parts)
 
 
@@ -99,6 +105,20 @@ def true_camera(camera: Camera, sensing: Sensing | None) -> Camera:
     position = transform(T_world_seen, jnp.array(camera.position))
     rows = tuple(tuple(rotation[i, j] for j in range(3)) for i in range(3))
     return dataclasses.replace(camera, rotation=rows, position=tuple(position[i] for i in range(3)))
+
+
+def sensed_depth(camera: Camera, world: World, image: Image, sensing: Sensing | None) -> Float[Array, "h w"]:
+    """The true depth of an image [m], infinite where nothing is, NaN where it is not measured.
+
+    Args:
+      camera: of the image.
+      world: the bodies in it.
+      image: as `observe` returns it.
+      sensing: of the episode.
+    """
+    if sensing is None or sensing.holes is None:
+        return image.depth
+    return jnp.where(sensing.holes.of(camera, world, image), jnp.nan, image.depth)
 
 
 def as_seen(bodies: Bodies, sensing: Sensing | None) -> Bodies:

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, resized, true_camera
+from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, resized, sensed_depth, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window, window_of
-from mechsearch_jax.envs.world.world import TARGET, World, plain_objects, true_superquadrics
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World, plain_objects, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.observation import Observation
@@ -21,6 +21,7 @@ from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -28,6 +29,8 @@ from mechsearch_jax.workspace.target import Target
 NEAR = 0.1
 # What is taken for the target farther than this from it is something else: a target's width and a half [m].
 NEAR_TARGET = 0.03
+# Share of the pixels of a body without which nothing is known of it.
+NEARLY = 0.05
 
 
 class Sight(flax.struct.PyTreeNode):
@@ -189,7 +192,8 @@ def oracle(key: Array, snapshot: Snapshot) -> Observation:
 
     Of a camera that is not where the planner takes it to be, the poses are those that the planner sees.
     """
-    return Observation(_seen_objects(snapshot), snapshot.target_seen, snapshot.target_pose).judged()
+    objects, measured, _ = _seen_objects(snapshot)
+    return Observation(objects, snapshot.target_seen & measured, snapshot.target_pose).judged()
 
 
 def informed(key: Array, snapshot: Snapshot) -> Observation:
@@ -198,11 +202,16 @@ def informed(key: Array, snapshot: Snapshot) -> Observation:
     An upper bound on searching: the target counts as visible in every observation, so that it is found from the start.
     Ignores the key.
     """
-    return Observation(_seen_objects(snapshot), jnp.array(True), snapshot.target_pose).judged()
+    return Observation(_seen_objects(snapshot)[0], jnp.array(True), snapshot.target_pose).judged()
 
 
-def _seen_objects(snapshot: Snapshot) -> Superquadrics:
+def _seen_objects(snapshot: Snapshot) -> tuple[Superquadrics, Bool[Array, ""], Float[Array, "h w"] | None]:
     """The true objects on the board, where they seem to be to the planner, and as large.
+
+    Those that lie in holes of the depth are left out.
+
+    Returns:
+      The objects, whether enough of the target has depth to be detected, and the view's depth, None without holes.
 
     Raises:
       InputError: depth or colour are measured otherwise, which without an image would change nothing.
@@ -211,7 +220,38 @@ def _seen_objects(snapshot: Snapshot) -> Superquadrics:
         raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
     if snapshot.sensing is not None and snapshot.sensing.colour is not None:
         raise InputError("color_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
-    return as_seen(resized(objects_on_the_board(snapshot), snapshot.sensing), snapshot.sensing)
+    objects = as_seen(resized(objects_on_the_board(snapshot), snapshot.sensing), snapshot.sensing)
+    if snapshot.sensing is None or snapshot.sensing.holes is None:
+        return objects, jnp.array(True), None
+    view = snapshot.view
+    depth, lost, pixels = in_holes(view, snapshot.world, snapshot.shelf, snapshot.sensing)
+    measured = pixels > found_pixels(snapshot.camera) / view.stride**2
+    return objects.replace(valid=objects.valid & ~lost[:TARGET]), measured, depth
+
+
+@kept()
+def in_holes(
+    view: View, world: World, shelf: Shelf, sensing: Sensing
+) -> tuple[Float[Array, "h w"], Bool[Array, " 9"], Int[Array, ""]]:
+    """What the holes of an episode leave of an image.
+
+    Args:
+      view: which rays of a camera are cast.
+      world: the true state.
+      shelf: the shelf in the image.
+      sensing: of the episode, with holes.
+
+    Returns:
+      The depth, as of `sensed_depth`; which bodies have none, or none but for `NEARLY` of what the image shows of them;
+      and how many pixels of the target have one.
+    """
+    assert sensing.holes is not None
+    image = observe(true_camera(view.camera, sensing), world, shelf)
+    depth = sensed_depth(view.camera, world, image, sensing)
+    is_shown = image.segmentation.reshape(-1, 1) == jnp.arange(BODIES)[None]
+    shown, measured = (jnp.sum(is_shown & where, axis=0) for where in (True, jnp.isfinite(depth).reshape(-1, 1)))
+    lost = sensing.holes.without_depth(world) | ((shown > 0) & (measured <= NEARLY * shown))
+    return depth, lost, measured[TARGET]
 
 
 def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:

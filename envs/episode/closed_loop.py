@@ -212,8 +212,9 @@ class EpisodePool:
                 trouble.setdefault(r, log.irretrievable)
             choice = None if r in trouble else choices.get(r)
             size = 1 if found[r] else int(knowledge.size[r])
-            truth = None if found[r] or r in lost else bool(knowledge.truth[r])
-            log.decide(record(bool(truly_found[r]), size, verdict, choice, truth, int(knowledge.restarts[r])))
+            searched = not found[r] and r not in lost
+            truth, around = (bool(a[r]) if searched else None for a in (knowledge.truth, knowledge.around))
+            log.decide(record(bool(truly_found[r]), size, verdict, choice, truth, int(knowledge.restarts[r]), around))
         return self._act({r: choice for r, choice in choices.items() if r not in trouble}, trouble)
 
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:

@@ -150,6 +150,7 @@ def record(
     choice: Choice | None,
     truth_possible: bool | None = None,
     restarts: int = 0,
+    around_possible: bool | None = None,
 ) -> Step:
     """The record of a step when it is decided; its results are filled in later.
 
@@ -158,7 +159,7 @@ def record(
       belief_size: number of poses where it can be.
       verdict: on the true state.
       choice: None if nothing is done.
-      truth_possible, restarts: as in `Step`.
+      truth_possible, restarts, around_possible: as in `Step`.
     """
     cost = predicted = action = None
     sequences = 0
@@ -181,6 +182,7 @@ def record(
         truth_possible=truth_possible,
         restarts=restarts,
         paper_graspable=verdict.paper_graspable,
+        around_possible=around_possible,
     )
 
 

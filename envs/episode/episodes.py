@@ -136,7 +136,10 @@ def _planner_slots(
     shapes: World = jax.tree.map(
         lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), from_scenario(scenarios[0])
     )
-    planner_slots = ManySlots(problem, policy, recogniser, shapes, min(settings.at_once, count), settings.trials)
+    sensing = first[0][1].sensing(problem)
+    planner_slots = ManySlots(
+        problem, policy, recogniser, shapes, min(settings.at_once, count), settings.trials, sensing
+    )
     # Raises before anything is compiled in vain.
     planner_slots.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
     planner_slots.sense_by({row: start.sensing(problem) for row, (_, start) in enumerate(first)})

@@ -79,6 +79,7 @@ class ManySlots:
         world: World,
         at_once: int,
         trials: Trials | None = None,
+        sensing: Sensing | None = None,
     ) -> None:
         """Args:
         problem: of all episodes.
@@ -87,6 +88,7 @@ class ManySlots:
         world: of all slots, or its shapes, for what recognisers make of it.
         at_once: how many slots are looked at or decided upon in one computation.
         trials: what tries actions out before one is made; nothing if left out.
+        sensing: of any slot, for what recognisers make of it.
         """
         self._problem, self._trials = problem, trials
         self._learned = LearnedFriction(trials, len(world.kind)) if isinstance(trials, LearnsFriction) else None
@@ -102,7 +104,11 @@ class ManySlots:
         self._policies: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
         shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
         seen = jax.eval_shape(
-            lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), shapes
+            lambda here, sensed: recogniser(
+                jax.random.key(0), Snapshot(problem.camera, problem.shelf, here, self._sight, sensed)
+            ),
+            shapes,
+            sensing,
         )
         empty = PlannerState(initial_belief(problem), seen, no_action(), truth_unseen())
         self._state: PlannerState = jax.tree.map(

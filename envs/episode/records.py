@@ -79,6 +79,8 @@ class Step:
       at_rest: whether everything came to rest after the action; False also where the simulation diverged.
       tracking_error: largest distance of a joint from its reference [rad].
       paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
+      around_possible: whether f holds any candidate pose of the true pose's cell or of the eight cells around it; None
+        where `truth_possible` is.
 
     From `fallen` to `tracking_error` they are None where nothing was executed.
     """
@@ -101,6 +103,7 @@ class Step:
     at_rest: bool | None = None
     tracking_error: float | None = None
     paper_graspable: bool = False
+    around_possible: bool | None = None
 
     @property
     def compares_costs(self) -> bool:

@@ -39,6 +39,7 @@ class BeliefSummary:
       found: whether it is found, shape (S,).
       size: number of candidate poses where it can be.
       truth: whether it can be at the candidate pose nearest to its true pose.
+      around: whether it can be at any candidate pose of that one's cell of the grid or of the eight cells around it.
       restarts: how often f was started anew.
       shown: whether what was taken for the target last was the target; see `snapshot.Truth`.
       bodies, there: of the last look, see `snapshot.Truth`; shape (S, 8).
@@ -47,6 +48,7 @@ class BeliefSummary:
     found: Bool[np.ndarray, " slots"]
     size: Int[np.ndarray, " slots"]
     truth: Bool[np.ndarray, " slots"]
+    around: Bool[np.ndarray, " slots"]
     restarts: Int[np.ndarray, " slots"]
     shown: Bool[np.ndarray, " slots"]
     bodies: Int[np.ndarray, "slots 8"]
@@ -207,17 +209,23 @@ class OneSlot:
 
 def summary(problem: Problem, belief: Belief, truth: Truth, world: World) -> BeliefSummary:
     """The beliefs of all slots; all fields, of the world in the base's frame, have a leading axis for them."""
-    size, possible = sizes_and_truths(problem, belief.exists, world)
-    fields = belief.found, size, possible, belief.restarts, truth.shown, truth.bodies, truth.there
+    size, possible, around = sizes_and_truths(problem, belief.exists, world)
+    fields = belief.found, size, possible, around, belief.restarts, truth.shown, truth.bodies, truth.there
     return BeliefSummary(*jax.device_get(fields))
 
 
 @kept()
-def sizes_and_truths(problem: Problem, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
-    """Number of candidate poses where the target can be, and whether it can be at the one nearest to the truth."""
+def sizes_and_truths(problem: Problem, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array, Array]:
+    """Number of candidate poses where the target can be, whether it can be at the one nearest to the truth, and whether
+    at any in that one's cell or in the eight around it."""
     poses, turn = problem.poses, problem.target.turn
     nearest = jax.vmap(lambda single: nearest_candidate(poses, true_target_pose(single), turn))(world)
-    return jnp.sum(exists, axis=1), jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
+    possible = jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
+    cells = jnp.any(exists.reshape(-1, *problem.target.grid, problem.target.yaws), axis=-1)
+    row, column = jnp.divmod(nearest // problem.target.yaws, problem.target.grid[1])
+    rows, columns = (jnp.arange(count)[None] for count in problem.target.grid)
+    beside = (jnp.abs(rows - row[:, None]) <= 1)[:, :, None] & (jnp.abs(columns - column[:, None]) <= 1)[:, None]
+    return jnp.sum(exists, axis=1), possible, jnp.any(cells & beside, axis=(1, 2))
 
 
 @kept()

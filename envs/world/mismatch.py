@@ -24,6 +24,7 @@ from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
 PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "soft-friction", "pyramidal-cone"]
+HolesName = Literal["none", "objects", "shadows", "scattered", "target", "patches"]
 
 # Largest shift of camera and shelf [m], and largest turn [degrees].
 FARTHEST, STEEPEST = 0.2, 20.0
@@ -63,6 +64,8 @@ class Mismatch:
       exposure: factor on all channels of the colour image.
       white_balance: share by which red is too strong in it and blue too weak.
       hue_gap: least difference of the objects' hues from the target's [degrees]; 0 for any colour.
+      holes: connected parts of the image without depth, by the name of one of `holes.HOLES`; `oracle` and `informed` do
+        not know what lies in them either.
     """
 
     friction: float = option(1.0, "factor on the simulated world's sliding frictions")
@@ -88,6 +91,9 @@ class Mismatch:
     exposure: float = option(1.0, "factor on the brightness of the simulated color image")
     white_balance: float = option(0.0, "share by which red is too strong and blue too weak in the color image")
     hue_gap: float = option(USUAL_HUE_GAP, "least difference of the objects' hues from the target's [degrees]")
+    holes: HolesName = option(
+        "none", "what the simulated depth camera does not measure, in connected holes", get_args(HolesName)
+    )
 
     def __post_init__(self):
         for name, low, high, unit in (
@@ -111,8 +117,9 @@ class Mismatch:
             check_range(f"Mismatch: {name}", getattr(self, name), low, high, unit)
             # Convert to one type, for rows keep what was given.
             object.__setattr__(self, name, float(getattr(self, name)))
-        if self.physics not in get_args(PhysicsName):
-            raise InputError(f'Mismatch: physics "{self.physics}" is unknown; use {", ".join(get_args(PhysicsName))}')
+        for name, names in (("physics", get_args(PhysicsName)), ("holes", get_args(HolesName))):
+            if getattr(self, name) not in names:
+                raise InputError(f'Mismatch: {name} "{getattr(self, name)}" is unknown; use {", ".join(names)}')
 
     @property
     def moves_robot(self) -> bool:
@@ -149,7 +156,7 @@ class Mismatch:
 
     def mould(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
-        return self.moves_camera, self.resizes, self.measures_otherwise, self.colours_otherwise
+        return self.moves_camera, self.resizes, self.measures_otherwise, self.colours_otherwise, self.holes
 
     def check(self, recognition: str, engine: str) -> None:
         """Check that episodes with a recogniser and a simulator, by their names, can have this mismatch.
@@ -175,9 +182,9 @@ class Mismatch:
     def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> ActualCell:
         """The cell of an episode, constant until its end.
 
-        Directions, axes and the bodies' shares of a spread are drawn from what the scenario holds and the episode's
-        seed. They do not depend on how far anything is shifted or turned, or on the spread, so that a sweep compares
-        like with like.
+        Directions, axes, the bodies' shares of a spread and the seed of holes are drawn from what the scenario holds
+        and the episode's seed. They do not depend on how far anything is shifted or turned, or on the spread, so that a
+        sweep compares like with like.
 
         Args:
           scenario, seed: of the episode.
@@ -204,6 +211,7 @@ class Mismatch:
             self.friction_spread**friction_share,
             self.mass_spread**mass_share,
             self.size_spread**size_share,
+            int(random.integers(2**32)),
         )
 
 
@@ -217,6 +225,7 @@ class ActualCell(NamedTuple):
       arm_stop: as of `Mismatch`.
       body_friction, body_mass: further factors on the sliding friction, and on mass and inertia, of each body.
       seen_size: factors on each body's width, depth and height as they are recognised.
+      holes_seed: of what is drawn for the camera's holes.
     """
 
     friction: float = 1.0
@@ -228,6 +237,7 @@ class ActualCell(NamedTuple):
     body_friction: Float[np.ndarray, " 9"] = np.ones(BODIES)
     body_mass: Float[np.ndarray, " 9"] = np.ones(BODIES)
     seen_size: Float[np.ndarray, "9 3"] = np.ones((BODIES, 3))
+    holes_seed: int = 0
 
 
 # As the planner assumes.

@@ -1,0 +1,167 @@
+"""Holes of a depth camera: connected parts of its image in which nothing is measured.
+
+What has no depth keeps its colour. Lengths in pixels are of an image of 1280 x 720 of the default camera, so that holes
+are as large in a thinned image as in the full one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, Image
+from mechsearch_jax.envs.world.mismatch import HolesName
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.runtime.errors import check_range
+from mechsearch_jax.workspace.camera import Camera
+
+USUAL_FX = Camera().fx
+# A stereo camera's second eye is so far to the right [m], as Intel's D435 has it.
+BASELINE = 0.05
+# Least difference in depth that casts a shadow [m], and the shadow's least and largest width in pixels.
+JUMP, NARROWEST, WIDEST = 0.04, 5.0, 20.0
+# Waves of which fields of blobs consist, and their lengths in patches and in clumps of scattered pixels.
+WAVES, PATCH, CLUMP = 32, 160.0, 12.0
+# Share of the scattered pixels that are lost in clumps.
+CLUMPED = 2 / 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Holes:
+    """What of a depth image is not measured. Hashable.
+
+    Attributes:
+      objects: probability of each object that it has no depth, as black, shiny and transparent things.
+      at_least_one: whether one object has none in any case.
+      target: whether the target has none.
+      shadows: whether there is none on the left of what stands before something else: what a stereo camera's second eye
+        does not see, `NARROWEST` to `WIDEST` pixels wide, the wider the more the depth differs.
+      scattered: share of the pixels that are lost, `CLUMPED` of them in clumps, the others singly.
+      patches: share of the pixels that show shelf or bodies which lie in connected patches without depth.
+    """
+
+    objects: float = 0.0
+    at_least_one: bool = False
+    target: bool = False
+    shadows: bool = False
+    scattered: float = 0.0
+    patches: float = 0.0
+
+    def __post_init__(self):
+        for name in ("objects", "scattered", "patches"):
+            check_range(f"Holes: {name}", getattr(self, name), 0.0, 1.0, "")
+
+
+HOLES: Mapping[HolesName, Holes] = MappingProxyType(
+    {
+        "none": Holes(),
+        "objects": Holes(objects=0.25, at_least_one=True),
+        "shadows": Holes(shadows=True),
+        "scattered": Holes(scattered=0.3),
+        "target": Holes(target=True),
+        "patches": Holes(patches=0.1),
+    }
+)
+
+
+class DrawnHoles(flax.struct.PyTreeNode):
+    """The holes of an episode: the same at every look, for the same image.
+
+    Attributes:
+      seed: of what is drawn, uint32, shape (...).
+      holes: of which kinds; static.
+    """
+
+    seed: jax.Array | np.ndarray
+    holes: Holes = flax.struct.field(pytree_node=False)
+
+    def without_depth(self, world: World) -> Bool[Array, " 9"]:
+        """Which bodies have no depth; none of those that are not there."""
+        chance = jax.random.uniform(self._key(0), (TARGET,))
+        chance = jnp.where(world.valid[:TARGET], chance, jnp.inf)
+        blank = chance < self.holes.objects
+        if self.holes.at_least_one:
+            blank |= jnp.isfinite(chance) & (chance == jnp.min(chance))
+        return jnp.append(blank, self.holes.target & world.valid[TARGET])
+
+    def of(self, camera: Camera, world: World, image: Image) -> Bool[Array, "h w"]:
+        """Which pixels of an image have no depth.
+
+        Args:
+          camera: of the image; may be traced.
+          world: the bodies in it.
+          image: as `observe` returns it.
+        """
+        owner, holes = image.segmentation, self.holes
+        is_body = (owner >= 0) & (owner < BODIES)
+        lost = is_body & self.without_depth(world)[jnp.clip(owner, 0, TARGET)]
+        if holes.shadows:
+            lost |= shadows(camera, image.depth)
+        if holes.scattered:
+            clumped = CLUMPED * holes.scattered
+            single = (holes.scattered - clumped) / (1.0 - clumped)
+            lost |= blobs(self._key(1), camera, jnp.ones(owner.shape, bool), clumped, CLUMP)
+            lost |= jax.random.uniform(self._key(2), owner.shape) < single
+        if holes.patches:
+            lost |= blobs(self._key(3), camera, owner != BACKGROUND, holes.patches, PATCH)
+        return lost
+
+    def _key(self, number: int) -> Key[Array, ""]:
+        return jax.random.fold_in(jax.random.key(self.seed), number)
+
+
+def shadows(camera: Camera, depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Which pixels have something nearer on their right that hides them from an eye farther to the right.
+
+    Args:
+      camera: of the image; may be traced.
+      depth: the true one [m]; infinite where nothing is.
+    """
+    scale, width = camera.fx / USUAL_FX, depth.shape[1]
+
+    def cast(k, lost):
+        nearer = jnp.where(jnp.arange(width) + k < width, jnp.roll(depth, -k, axis=1), jnp.inf)
+        disparity = BASELINE * camera.fx * (1.0 / nearer - 1.0 / depth)
+        reach = jnp.ceil(jnp.clip(disparity, NARROWEST * scale, WIDEST * scale))
+        return lost | ((depth - nearer > JUMP) & (k <= reach))
+
+    farthest = jnp.ceil(jnp.asarray(WIDEST * scale)).astype(int)
+    return jax.lax.fori_loop(1, farthest + 1, cast, jnp.zeros(depth.shape, bool))
+
+
+def blobs(
+    key: Key[Array, ""], camera: Camera, inside: Bool[Array, "h w"], share: float, length: float
+) -> Bool[Array, "h w"]:
+    """Connected blobs that take a share of the pixels `inside`.
+
+    They lie where a sum of plane waves of about one length is largest. The waves belong to the rays, so that a camera
+    with more pixels, or with a part of them, sees the same blobs.
+
+    Args:
+      key: PRNG key.
+      camera: of the image; may be traced.
+      inside: where blobs may be.
+      share: of those pixels.
+      length: of the waves, in pixels.
+    """
+    turn, stretch, phase = jax.random.uniform(key, (3, WAVES, 1))
+    count = 2 * math.pi * USUAL_FX / length * (0.75 + 0.5 * stretch)
+    height, width = inside.shape
+    x = (jnp.arange(width) + 0.5 - camera.cx) / camera.fx
+    y = (jnp.arange(height) + 0.5 - camera.cy) / camera.fy
+    along = count * jnp.cos(2 * math.pi * turn) * x[None] + 2 * math.pi * phase
+    down = count * jnp.sin(2 * math.pi * turn) * y[None]
+    # cos(a + b) = cos a cos b - sin a sin b
+    field = jnp.einsum("kh,kw->hw", jnp.cos(down), jnp.cos(along), precision="highest")
+    field -= jnp.einsum("kh,kw->hw", jnp.sin(down), jnp.sin(along), precision="highest")
+    highest = jnp.sort(jnp.where(inside, field, -jnp.inf).reshape(-1), descending=True)
+    number = jnp.round(share * jnp.sum(inside)).astype(int)
+    return inside & (field > highest[jnp.minimum(number, highest.size - 1)])

@@ -1,0 +1,233 @@
+"""Holes of the simulated depth camera: what is not measured, and what recognisers make of the rest."""
+
+import dataclasses
+from typing import get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import ndimage
+from stage import HIDDEN, OPEN, TWO, grab
+
+from mechsearch_jax.envs.camera.holes import BASELINE, HOLES, JUMP, NARROWEST, WIDEST, DrawnHoles, Holes, shadows
+from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
+from mechsearch_jax.envs.camera.sensing import sensed_depth, sensing_of
+from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, observe
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
+from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
+from mechsearch_jax.envs.episode.many_slots import ManySlots
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.slots import OneSlot
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.world.mismatch import ASSUMED, HolesName, Mismatch
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.images.cloud import thinned_view
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+CAMERA, SHELF = Camera(), Shelf()
+SMALL = CAMERA.scaled(4)
+SCENE = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+NAMES = [name for name in HOLES if name != "none"]
+
+
+def drawn(holes, seed=0):
+    return DrawnHoles(np.uint32(seed), HOLES[holes] if isinstance(holes, str) else holes)
+
+
+def sensed(name, scene=SCENE, seed=0):
+    mismatch = Mismatch(holes=name)
+    return sensing_of(mismatch, mismatch.drawn(scene, seed, CAMERA, SHELF))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return from_scenario(SCENE)
+
+
+@pytest.fixture(scope="module")
+def image(world):
+    return observe(SMALL, world, SHELF)
+
+
+def test_every_name_has_holes_and_none_is_as_before(world, image):
+    assert tuple(HOLES) == get_args(HolesName)
+    assert sensed("none") is None
+    assert sensed_depth(SMALL, world, image, None) is image.depth
+    assert ASSUMED.mould() == Mismatch(holes="none").mould() != Mismatch(holes="patches").mould()
+    assert "mismatch.holes" not in Method().options()
+    method = Method(mismatch=Mismatch(holes="shadows"))
+    assert method.options()["mismatch.holes"] == "shadows"
+    assert Method.of_options(method.options()) == method
+    with pytest.raises(InputError, match='holes "some" is unknown; use none, objects'):
+        Mismatch(holes="some")
+    with pytest.raises(InputError, match="Holes: patches"):
+        Holes(patches=1.5)
+
+
+def test_holes_belong_to_an_episode():
+    seeds = [int(sensed("patches", *each).holes.seed) for each in ((SCENE, 0), (SCENE, 0), (SCENE, 1), (OPEN, 0))]
+    assert seeds[0] == seeds[1]
+    assert len(set(seeds)) == 3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_eager_jitted_and_in_a_batch_the_same_pixels_are_lost(world, image, name):
+    seeds = np.array([0, 2**32 - 1], np.uint32)
+
+    def lost(seed):
+        return DrawnHoles(seed, HOLES[name]).of(SMALL, world, image)
+
+    many = jax.jit(jax.vmap(lost))(seeds)
+    for seed, one in zip(seeds, many, strict=True):
+        # Rounding decides at the edge of a blob.
+        for other in (lost(seed), jax.jit(lost)(seed)):
+            assert np.mean(np.asarray(other) != np.asarray(one)) < 1e-4
+    # Its target is hidden.
+    assert np.asarray(many).any() == (name != "target")
+
+
+@pytest.mark.parametrize(("holes", "least"), [(Holes(patches=0.1), 60), (Holes(patches=0.3), 100)])
+def test_patches_are_connected_and_take_their_share_of_the_shelf(world, image, holes, least):
+    lost = np.asarray(drawn(holes).of(SMALL, world, image))
+    shelf = np.asarray(image.segmentation) != BACKGROUND
+    assert not (lost & ~shelf).any()
+    assert lost[shelf].mean() == pytest.approx(holes.patches, abs=0.001)
+    numbers, count = ndimage.label(lost)
+    sizes = np.bincount(numbers[lost])[1:]
+    assert 3 < count < 60
+    assert sizes[sizes >= least].sum() > 0.9 * lost.sum()
+
+
+def test_scattered_pixels_are_lost_in_clumps_and_singly(world):
+    part = dataclasses.replace(CAMERA, width=320, height=240)
+    lost = np.asarray(drawn("scattered").of(part, world, observe(part, world, SHELF)))
+    assert lost.mean() == pytest.approx(0.3, abs=0.01)
+    numbers, _ = ndimage.label(lost)
+    sizes = np.bincount(numbers[lost])[1:]
+    assert (sizes == 1).sum() > 100
+    assert sizes[sizes >= 9].sum() > 0.5 * lost.sum()
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+@pytest.mark.parametrize(
+    ("near", "width"), [(0.6, WIDEST), (0.8, BASELINE * CAMERA.fx * 0.25), (0.94, NARROWEST), (1.0 - JUMP / 2, 0)]
+)
+def test_shadows_lie_on_the_left_and_are_as_wide_as_the_depth_differs(factor, near, width):
+    camera, left, right = CAMERA.scaled(factor), 60, 90
+    depth = jnp.ones((2, 120)).at[0, left:right].set(near)
+    lost = np.asarray(shadows(camera, depth))
+    assert np.flatnonzero(lost[0]).tolist() == list(range(left - int(np.ceil(width / factor)), left))
+    assert not lost[1].any()
+
+
+def test_shadows_of_a_scene_stay_beside_things(world, image):
+    lost = np.asarray(drawn("shadows").of(SMALL, world, image))
+    runs = np.diff(np.flatnonzero(np.diff(np.pad(lost, ((0, 0), (1, 1))).astype(int).reshape(-1)))[:])[::2]
+    assert 0.002 < lost.mean() < 0.08
+    assert np.median(runs) >= NARROWEST / 4
+
+
+def test_an_object_without_depth_has_none_at_every_look(world, image):
+    moved = world.replace(position=world.position + jnp.array([[0.01, 0.02, 0.0]]))
+    counts = []
+    for seed in range(40):
+        holes = drawn("objects", seed)
+        blank = np.asarray(holes.without_depth(world))
+        np.testing.assert_array_equal(blank, holes.without_depth(moved))
+        counts.append(blank.sum())
+        assert not blank[TARGET]
+        assert not (blank & ~np.asarray(world.valid)).any()
+    there = int(np.asarray(world.valid)[:TARGET].sum())
+    assert min(counts) == 1
+    assert 0.2 * there < np.mean(counts) < 0.45 * there
+    owner = np.asarray(image.segmentation)
+    np.testing.assert_array_equal(holes.of(SMALL, world, image), np.isin(owner, np.flatnonzero(blank)))
+
+
+def test_holes_are_as_large_in_a_thinned_image(world):
+    view = thinned_view(CAMERA, SHELF)
+    full, thin = (drawn("patches").of(c, world, observe(c, world, SHELF)) for c in (CAMERA, view.camera))
+    # The share is of another part of the image.
+    assert np.mean(np.asarray(view.of(full)) != np.asarray(thin)) < 0.05
+
+
+@pytest.mark.parametrize("recognise", [oracle, informed])
+def test_true_shapes_without_depth_are_left_out(recognise):
+    world = from_scenario(TWO)
+
+    def seen(name):
+        return recognise(jax.random.key(0), Snapshot(CAMERA, SHELF, world, sensing=sensed(name, TWO)))
+
+    assert np.asarray(seen("none").objects.valid).sum() == 2
+    left = np.asarray(seen("objects").objects.valid)
+    np.testing.assert_array_equal(left[:2], ~np.asarray(sensed("objects", TWO).holes.without_depth(world))[:2])
+    assert np.asarray(seen("shadows").objects.valid).sum() == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "visible"), [("none", True), ("shadows", True), ("scattered", True), ("target", False)]
+)
+def test_a_target_without_depth_is_not_seen(name, visible):
+    snapshot = Snapshot(CAMERA, SHELF, from_scenario(OPEN), sensing=sensed(name, OPEN))
+    assert bool(oracle(jax.random.key(0), snapshot).target_visible) is visible
+    assert bool(informed(jax.random.key(0), snapshot).target_visible)
+
+
+def test_masks_have_no_points_in_holes():
+    masks, view, world = recogniser("masks", target_of(OPEN)), thinned_view(CAMERA, SHELF), from_scenario(OPEN)
+    holes = sensed("target", OPEN)
+    image = labelled(jax.random.key(0), masks, view, SHELF, world, jnp.array(True), holes)
+    there = np.asarray(observe(view.camera, world, SHELF).segmentation) == TARGET
+    assert there.sum() > 100
+    assert np.isnan(np.asarray(image.points)[there]).all()
+    assert np.isnan(np.asarray(image.depth)[there]).all()
+    assert np.isfinite(np.asarray(image.points)[~there]).any()
+    assert not np.asarray(image.of_target).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["masks", "full"])
+def test_recognisers_see_no_target_without_depth(name):
+    recognise, world = recogniser(name, target_of(OPEN)), from_scenario(OPEN)
+    for holes in ("none", "target"):
+        seen = recognise(jax.random.key(0), Snapshot(CAMERA, SHELF, world, sensing=sensed(holes, OPEN)))
+        assert bool(seen.target_visible) is (holes == "none")
+        assert np.isfinite(np.asarray(seen.objects.position)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["objects", "patches"])
+def test_episodes_with_holes_are_the_same_alone_and_in_a_batch(problem, name):
+    starts = [Start(scene, seed, mismatch=Mismatch(holes=name)) for scene, seed in ((HIDDEN, 0), (TWO, 1), (OPEN, 2))]
+    settings, episodes = RunSettings(max_steps=2, at_once=2), []
+    run_episodes(starts, problem, grab, NativeSimulator(threads=1), 2, Listeners(episodes.extend), settings)
+    for place, episode in episodes:
+        again = run_episode(starts[place], problem, grab, NativeSimulator(), settings)
+        what = [
+            [(s.belief_size, s.found, s.truth_possible, s.around_possible) for s in e.steps] for e in (episode, again)
+        ]
+        assert what[0] == what[1]
+
+
+@pytest.mark.slow
+def test_slots_see_their_own_holes(problem):
+    world, mismatch = from_scenario(TWO), Mismatch(holes="objects")
+    sensings = [Start(TWO, seed, mismatch=mismatch).sensing(problem) for seed in range(4)]
+    worlds = jax.tree.map(lambda a: jnp.stack([a] * 4), world)
+    slots = ManySlots(problem, Method().policy(), oracle, worlds, 2, sensing=sensings[0])
+    slots.sense_by(dict(enumerate(sensings)))
+    keys = jax.random.split(jax.random.key(0), 4)
+    together = slots.look(worlds, keys, range(4))
+    valid = np.asarray(slots._state.observation.objects.valid)
+    assert len({tuple(row) for row in valid}) > 1
+    for row, sensing in enumerate(sensings):
+        one = OneSlot(problem, Method().policy(), oracle)
+        one.sense_by({0: sensing})
+        alone = one.look(jax.tree.map(lambda a: a[:1], worlds), keys[row : row + 1], [0])
+        np.testing.assert_array_equal(valid[row], one.observation.objects.valid)
+        assert (alone.size[0], alone.truth[0]) == (together.size[row], together.truth[row])
