@@ -32,10 +32,10 @@ KEY_DIGITS = 32
 EVENTS = (
     *("looks", "truth_lost", "truth_lost_step", "restarts"),
     *("objects_fallen", "fallen_step", "held_up", "unsettled"),
-    *("truth_ruled_out", "truth_ruled_out_step"),
+    *("truth_ruled_out", "truth_ruled_out_step", "blind_actions"),
 )
 # Columns that tables of before do not have; they say nothing of it.
-_LATER = frozenset(("truth_ruled_out", "truth_ruled_out_step"))
+_LATER = frozenset(("truth_ruled_out", "truth_ruled_out_step", "blind_actions"))
 # How the reason begins where the program failed, not the robot.
 ERROR = "error: "
 # Between kinds of action in their column.
@@ -95,6 +95,7 @@ class Row:
       truth_ruled_out: at how many of the `looks` f ruled out every candidate pose of the true pose's cell and of the
         eight cells around it; None where that is not known.
       truth_ruled_out_step: number of actions before the first of these; None where there was none.
+      blind_actions: number of actions that swept space of which nothing was measured.
 
     From `looks` to `unsettled`, `compile_seconds`, `device`, `versions` and the last two are None for an episode that
     could not be run to its end.
@@ -135,6 +136,7 @@ class Row:
     versions: str | None = None
     truth_ruled_out: int | None = None
     truth_ruled_out_step: int | None = None
+    blind_actions: int | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode, code: str = "") -> Row:
@@ -205,6 +207,7 @@ def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
         "unsettled": sum(step.at_rest is False for step in steps),
         "truth_ruled_out": len(ruled_out),
         "truth_ruled_out_step": min(ruled_out, default=None),
+        "blind_actions": sum(bool(step.blind) for step in steps),
     }
 
 

@@ -31,6 +31,7 @@ from mechsearch_jax.images.cloud import MARGIN, View, above_board
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.detection import ColouredDepth, Detection, detect
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
@@ -104,7 +105,8 @@ class ImageRecogniser:
             image = image.replace(of_target=image.of_target & seen)
         shapes = ShapeNetwork.of(self.weights)
         fitted = self.fitter(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
-        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence)
+        measured = measured_share(snapshot.camera, view, image.depth)
+        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence, measured)
 
 
 @kept(static_argnames=("recogniser",))
@@ -188,7 +190,8 @@ class ColourRecogniser:
         shapes = ShapeNetwork.of(self.weights)
         settings = (shapes, view.camera, shelf, self.target, self.refinement)
         fitted = self.fitter(keys[2:], image, *settings, least=SAMPLED * unseen)
-        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence)
+        measured = measured_share(snapshot.camera, view, image.depth)
+        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence, measured)
 
 
 def sighted(

@@ -16,6 +16,7 @@ from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, plain_objects, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View, thinned_view
+from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.runtime.compiled import kept
@@ -192,8 +193,10 @@ def oracle(key: Array, snapshot: Snapshot) -> Observation:
 
     Of a camera that is not where the planner takes it to be, the poses are those that the planner sees.
     """
-    objects, measured, _ = _seen_objects(snapshot)
-    return Observation(objects, snapshot.target_seen & measured, snapshot.target_pose).judged()
+    objects, detected, depth = _seen_objects(snapshot)
+    measured = None if depth is None else measured_share(snapshot.camera, snapshot.view, depth)
+    seen = Observation(objects, snapshot.target_seen & detected, snapshot.target_pose, measured=measured)
+    return seen.judged()
 
 
 def informed(key: Array, snapshot: Snapshot) -> Observation:

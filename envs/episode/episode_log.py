@@ -34,6 +34,7 @@ class Choice(flax.struct.PyTreeNode):
       others: the first actions of all sequences, the best first, of kind NONE after the last; None if not kept.
       bodies: the number of the body that each object stands for, shape (N,); None if objects have the bodies' numbers.
       there: whether it stands for that body, shape (N,); None if all do.
+      blind: whether it sweeps space that was not measured, see `belief.sweeps_unmeasured`.
     """
 
     action: Action
@@ -44,6 +45,7 @@ class Choice(flax.struct.PyTreeNode):
     others: Action | None = None
     bodies: Int[np.ndarray, " objects"] | None = None
     there: Bool[np.ndarray, " objects"] | None = None
+    blind: jax.Array | bool = False
 
     @property
     def executed(self) -> Action:
@@ -183,6 +185,7 @@ def record(
         restarts=restarts,
         paper_graspable=verdict.paper_graspable,
         around_possible=around_possible,
+        blind=None if choice is None else bool(choice.blind),
     )
 
 

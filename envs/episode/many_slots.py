@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
-from mechsearch_jax.belief.belief import without_grasps
+from mechsearch_jax.belief.belief import sweeps_unmeasured, without_grasps
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of, truth_unseen
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
-from mechsearch_jax.envs.episode.slots import BeliefSummary, sizes_and_truths, summary, swept_free_of
+from mechsearch_jax.envs.episode.slots import BeliefSummary, may_be_blind, sizes_and_truths, summary, swept_free_of
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
@@ -218,6 +218,8 @@ class ManySlots:
         ):
             over = np.array([r in last for r in chunk] + [False] * (self._at_once - len(chunk)))
             decided = _choose(decision, results, jax.device_put(over))
+            if may_be_blind(self._state.belief):
+                decided = decided.replace(blind=_blind(self._problem, self._state, decided.action, padded))
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             choices |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(chunk)}
@@ -293,6 +295,14 @@ def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
     here = _rows_of(world, rows)
     return here.replace(valid=here.valid & (rows < len(world.kind))[:, None])
+
+
+@kept()
+def _blind(problem: Problem, state: PlannerState, action: Action, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
+    """Whether actions in the slots `rows` sweep space that was not measured."""
+    here = _rows_of(state, rows)
+    sweeps = functools.partial(sweeps_unmeasured, problem)
+    return jax.vmap(sweeps)(here.belief, here.observation.objects, action)
 
 
 @kept()

@@ -81,6 +81,7 @@ class Step:
       paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
       around_possible: whether f holds any candidate pose of the true pose's cell or of the eight cells around it; None
         where `truth_possible` is.
+      blind: whether the action sweeps space of which nothing was measured; None where nothing was decided.
 
     From `fallen` to `tracking_error` they are None where nothing was executed.
     """
@@ -104,6 +105,7 @@ class Step:
     tracking_error: float | None = None
     paper_graspable: bool = False
     around_possible: bool | None = None
+    blind: bool | None = None
 
     @property
     def compares_costs(self) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.belief.belief import sweeps_unmeasured
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, Truth, true_target_pose, truth_of
@@ -186,7 +187,11 @@ class OneSlot:
             self._policy, self.noted, keys[0], self._problem, self.belief, self.observation, 0 in last
         )
         self.action = self.decision.action
-        return {0: jax.device_get(chosen(self.decision))}
+        choice = chosen(self.decision)
+        if may_be_blind(self.belief):
+            objects = self.observation.objects
+            choice = choice.replace(blind=sweeps_unmeasured(self._problem, self.belief, objects, self.action))
+        return {0: jax.device_get(choice)}
 
     def took(self, actions: Mapping[int, Action]) -> None:
         """See `Slots`."""
@@ -205,6 +210,11 @@ class OneSlot:
     def _snapshot(self, world: World) -> Snapshot:
         single = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[0]), world)
         return Snapshot(self._problem.camera, self._problem.shelf, single)
+
+
+def may_be_blind(belief: Belief) -> bool:
+    """Whether in any slot a part of the board was not measured."""
+    return bool(np.isfinite(np.asarray(belief.unmeasured)).any())
 
 
 def summary(problem: Problem, belief: Belief, truth: Truth, world: World) -> BeliefSummary:

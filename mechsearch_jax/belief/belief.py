@@ -14,7 +14,7 @@ from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import BORDER, PossibleSpace, bordered, enters_unmeasured, widen
 from mechsearch_jax.belief.unmeasured import unmeasured_heights
-from mechsearch_jax.belief.unseen_motion import reopened, sweeps
+from mechsearch_jax.belief.unseen_motion import moved_by, reopened, sweeps
 from mechsearch_jax.existence import allowances, closer_image, free, object_views, plainly_elsewhere, undetected
 from mechsearch_jax.geometry.bodies import with_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -88,8 +88,8 @@ def update_belief(
     more, and f is reset to what the present objects allow. One observation suffices for this, so that a detector that
     misses the target once, or a sensor that measures less than a third of it, costs one decision.
 
-    What was not measured (`Observation.measured`) shows nothing: f stays as it was there, and something without depth may
-    stand there (`Belief.unmeasured`), unless it was seen to be free and nothing was done since.
+    What was not measured (`Observation.measured`) shows nothing: f stays as it was there, and something without depth
+    may stand there (`Belief.unmeasured`), unless it was seen to be free and nothing was done since.
 
     If the action may have moved a hidden target, f is first reopened (`unseen_motion.reopened`). If f becomes empty
     nevertheless, which is a contradiction, space that is hidden or not measured is opened again, and `restarts` counts
@@ -210,20 +210,21 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
 
 
 @kept()
-def sweeps_unmeasured(
-    problem: Problem, belief: Belief, before: Superquadrics, after: Superquadrics, action: Action
-) -> Bool[Array, ""]:
-    """Whether the hand, or what it moves, sweeps space in which something may stand that has no depth.
+def sweeps_unmeasured(problem: Problem, belief: Belief, objects: Superquadrics, action: Action) -> Bool[Array, ""]:
+    """Whether the hand, or the object that it moves, sweeps space in which something may stand that has no depth.
+
+    Of the objects that a pushed one pushes nothing is asked: an approximation.
 
     Args:
       problem, belief: constants of the search, and the belief after the last look.
-      before, after: the recognised objects, and where the action is predicted to leave them, in the same slots.
+      objects: the recognised objects, fields (N, ...).
       action: a single action.
     """
     space = possible_space(problem, belief, belief.exists)
+    after = moved_by(objects, action)
     entered = [
         jnp.any(sweep.counts & enters_unmeasured(space, sweep.points))
-        for sweep in sweeps(problem, before, after, action)
+        for sweep in sweeps(problem, objects, after, action)
     ]
     return jnp.any(jnp.stack(entered)) & (action.kind != ActionKind.NONE)
 

@@ -23,7 +23,7 @@ from mechsearch_jax.actions.registry import KINDS, ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.bodies import surfaces
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
+from mechsearch_jax.geometry.transforms import compose, inverse, make, matmul, transform
 from mechsearch_jax.problem.problem import Problem
 
 # Smaller displacements of an object's centre are noise of recognition, or cannot move a target to another cell [m].
@@ -88,15 +88,32 @@ class Sweep(NamedTuple):
     travel: Array | float
 
 
+def moved_by(objects: Superquadrics, action: Action) -> Superquadrics:
+    """The objects after an action that moves its own object alone, as planned; also of one that moves none."""
+    holds = _any_kind(action, "holds_object")
+    moves = (jnp.arange(objects.capacity) == action.object) & objects.valid & ~_any_kind(action, "takes_target")
+    carry = compose(action.T_world_place, inverse(action.T_world_gripper))
+    position = jnp.where(holds, transform(carry, objects.position), objects.position + action.displacement[None])
+    turned = matmul(carry[None, :3, :3], objects.rotation)
+    return objects.replace(
+        position=jnp.where(moves[:, None], position, objects.position),
+        rotation=jnp.where((moves & holds)[:, None, None], turned, objects.rotation),
+    )
+
+
+def _any_kind(action: Action, what: str) -> Bool[Array, ""]:
+    """Whether an action is of a kind that has a property of `Kind`."""
+    return jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if getattr(kind, what)]))
+
+
 def sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, action: Action) -> tuple[Sweep, ...]:
     """The stretches of an action: the way in, the push with the objects it moved, the way out, the way to a new place.
 
     The first pose of a moving object is left out, for it moves away from what touches it there.
     """
     n, approach = before.capacity, problem.gripper.approach
-    holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
-    takes = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.takes_target]))
-    is_acted_on = (jnp.arange(n) == action.object) & before.valid & ~takes
+    holds = _any_kind(action, "holds_object")
+    is_acted_on = (jnp.arange(n) == action.object) & before.valid & ~_any_kind(action, "takes_target")
     carry = compose(action.T_world_place, inverse(action.T_world_gripper))
     planned = jnp.where(holds, transform(carry, before.position), before.position + action.displacement[None])
     same, matched = same_objects(before, after, jnp.where(is_acted_on[:, None], planned, before.position))

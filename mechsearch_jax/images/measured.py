@@ -1,6 +1,6 @@
 """Which part of a depth image was measured: only a pixel that was says what is not there.
 
-Black, shiny and transparent things, the shadows of a stereo camera and mirrors have no depth: what is there is not known.
+Black, shiny and transparent things, shadows of a stereo camera and mirrors have no depth: what is there is not known.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.cloud import View
+from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import longer
 
@@ -23,6 +24,7 @@ def share_step(camera: Camera) -> int:
     return max(round(DOWNSCALE * longer(camera)), 1)
 
 
+@kept()
 def measured_share(camera: Camera, view: View, depth: Float[Array, "h w"]) -> Float[Array, "rows columns"]:
     """The share of the pixels of each block of a camera's image that was measured, from a view of the image.
 

@@ -153,7 +153,7 @@ def motion_of(
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
     verb = kind.describe(decision.action, observation.objects.capacity)
-    if sweeps_unmeasured(problem, belief, observation.objects, decision.predicted, decision.action):
+    if sweeps_unmeasured(problem, belief, observation.objects, decision.action):
         return Motion(nothing, f"{target}; to {verb} is not possible: {UNMEASURED}", None, blocked=True)
     try:
         check_recognition(problem, observation, depth, config.doubt)
