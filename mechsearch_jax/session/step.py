@@ -18,7 +18,6 @@ from mechsearch_jax.belief.belief import Belief, graspability_map
 from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
-from mechsearch_jax.perception.plausibility import sight_faults
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
@@ -125,6 +124,7 @@ def motion_of(
     observation: Observation,
     decision: Decision,
     depth: Float[np.ndarray, "h w"],
+    unseen: tuple[str, ...],
     present: Present,
     arm: ArmConfig,
     config: TrajectoryConfig,
@@ -134,6 +134,7 @@ def motion_of(
     Args:
       problem, belief, observation, decision: the decision and what it is based on.
       depth: the image that `observation` comes from.
+      unseen: why nothing is recognised in it; empty if anything is.
       present: arm and hand.
       arm: home and speed.
       config: how trajectories are made.
@@ -141,8 +142,8 @@ def motion_of(
     kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
     target = "the target is found" if belief.found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
     if kind.code == ActionKind.NONE:
-        if faults := sight_faults(problem.camera, problem.shelf, depth, observation):
-            return Motion(nothing, "; ".join(faults), None)
+        if unseen:
+            return Motion(nothing, "; ".join(unseen), None)
         refused = int(decision.refused)
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
