@@ -162,7 +162,7 @@ def test_an_empty_shelf_differs_from_one_on_which_nothing_is_recognised():
     assert sight_faults(look(depth), nothing_seen().replace(target_visible=jnp.array(True))) == ()
 
 
-@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, -np.inf, 65.535, 1000.0])
 def test_an_image_without_a_measurement_is_said_and_refused(value):
     depth = np.full((CAMERA.height, CAMERA.width), value, np.float32)
     with pytest.raises(InputError, match="depth image: nothing was measured where it shows the shelf"):

@@ -26,7 +26,7 @@ from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
 from mechsearch_jax.images.target_pixels import evened
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf
 
 _evened = jax.jit(evened)
@@ -110,12 +110,12 @@ def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.nda
     check_images(camera, depth, colour, None if mask is None else np.clip(mask, OTHER, 0))
     if colour.dtype == np.uint8:
         raise InputError("colour image: must be floats from 0 to 1; divide 8-bit values by 255")
-    measured = np.isfinite(depth) & (depth > 0)
-    if not measured.any():
+    known = np.isfinite(depth) & measured(depth)
+    if not known.any():
         raise InputError(
             "depth image: nothing was measured: no positive depth; it must be in metres along the camera's axis"
         )
-    return np.where(measured, depth, np.nan).astype(np.float32)
+    return np.where(known, depth, np.nan).astype(np.float32)
 
 
 def _fixed(rng: np.random.Generator, points: np.ndarray, count: int) -> tuple[Array, Array]:

@@ -5,7 +5,6 @@ On the host, before recognition: otherwise wrong units, poses and masks end in a
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mechsearch_jax.calibration.faces import FACES, Face
 from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.planes import PlaneConfig, find_plane
@@ -56,28 +56,7 @@ PATCH_PIXELS = (0.4, 1.6)
 EMPTY_SHELF = "the shelf is empty: no object and no target is seen"
 
 
-@dataclasses.dataclass(frozen=True)
-class Wall:
-    """A vertical face of a shelf.
-
-    Attributes:
-      name: in messages.
-      face: name of the `Shelf`'s field that gives its place.
-      axis: of that field: 0 for x, 1 for y.
-      outward: 1 if larger coordinates are outside the shelf, -1 if smaller ones are.
-    """
-
-    name: str
-    face: str
-    axis: int
-    outward: int
-
-
-WALLS = (
-    Wall("the back wall", "back", 0, 1),
-    Wall("the right side wall", "right", 1, -1),
-    Wall("the left side wall", "left", 1, 1),
-)
+WALLS = tuple(face for face in FACES if face.axis != 2)
 
 
 def image_faults(look: Look) -> tuple[str, ...]:
@@ -137,12 +116,12 @@ def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
     )
 
 
-def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> str | None:
+def _wall_fault(shelf: Shelf, wall: Face, points: Float[np.ndarray, "n 3"]) -> str | None:
     """A warning if the points show a wall at another place; None if they show too little of it.
 
     The wall is the farthest plane with many points that is wider than any object.
     """
-    past, sideways = wall.outward * (points[:, wall.axis] - getattr(shelf, wall.face)), points[:, 1 - wall.axis]
+    past, sideways = -wall.height(shelf, points), points[:, 1 - wall.axis]
     low, high = (shelf.right, shelf.left) if wall.axis == 0 else (shelf.front, shelf.back)
     between = (sideways > low + WALL_MARGIN) & (sideways < high - WALL_MARGIN)
     upright = (points[:, 2] > shelf.board + WALL_MARGIN) & (points[:, 2] < shelf.ceiling - WALL_MARGIN)
@@ -175,12 +154,12 @@ def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> s
     if abs(off) <= FLOOR_TOLERANCE:
         return None
     return (
-        f"depth image: {wall.name} appears {100 * abs(off):.1f} cm {_way(wall, off)} than shelf.{wall.face} says; "
+        f"depth image: the {wall.name} appears {100 * abs(off):.1f} cm {_way(wall, off)} than shelf.{wall.field} says; "
         f"check the place of the shelf in {'xy'[wall.axis]} and the pose of the camera"
     )
 
 
-def _way(wall: Wall, off: float) -> str:
+def _way(wall: Face, off: float) -> str:
     if wall.axis == 0:
         return "farther" if off > 0 else "nearer"
     return "farther out" if off > 0 else "farther in"
@@ -190,11 +169,11 @@ def _edge_fault(camera: Camera, shelf: Shelf, points: Float[np.ndarray, "n 3"]) 
     """A warning if the points show the board's front edge at another place; None if they show too little of it."""
     x, y, z = points.T
     board = (np.abs(z - shelf.board) < 0.008) & (np.abs(x - shelf.front) < 2 * WALL_SEARCH)
-    across = (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
-    strip = ((y - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
+    board &= (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
+    x, strip = x[board], ((y[board] - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
     firsts = []
     for i in np.flatnonzero(_edge_in_image(camera, shelf)):
-        in_strip = x[board & across & (strip == i)]
+        in_strip = x[strip == i]
         if len(in_strip) >= 10:
             # Not the minimum: at an edge a sensor may measure a mixture of both depths.
             firsts.append(np.percentile(in_strip, 2))

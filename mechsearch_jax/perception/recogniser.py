@@ -28,7 +28,7 @@ from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
@@ -173,8 +173,8 @@ class Recogniser:
 
         Args:
           key: PRNG key of the drawn points.
-          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured, infinite where there is
-            nothing for at least 3 m.
+          depth: float (H, W), metres along the camera's z; 0, NaN or 65.535 where nothing was measured, infinite where
+            there is nothing for at least 3 m.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to 8, or
             OTHER (-1), FREE (-2) or MISSING (-3) of `images.labels`. Points on the shelf's faces always count as FREE.
@@ -224,7 +224,7 @@ def _labelled(
     """The shelf's part of the image with labels, and whether the target is visible in it."""
     camera, view, shelf = recogniser.camera, recogniser.view, recogniser.shelf
     seen = view.of(jnp.asarray(depth, jnp.float32))
-    seen = jnp.where(seen > 0.0, seen, jnp.nan)
+    seen = jnp.where(measured(seen), seen, jnp.nan)
     points = back_project(view.camera, seen)
 
     # Points on the board's faces may be the target's.

@@ -26,6 +26,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.step_json import step_json
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
+from mechsearch_jax.workspace.camera import measured
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -176,9 +177,9 @@ def display_image(depth: np.ndarray, colour: Any) -> np.ndarray:
     if colour is not None:
         image = np.asarray(colour)
         return image if image.dtype == np.uint8 else np.round(255 * image).astype(np.uint8)
-    measured = np.isfinite(depth) & (depth > 0)
-    low, high = np.percentile(depth[measured], (1, 99)) if measured.any() else (0.0, 1.0)
+    known = np.isfinite(depth) & measured(depth)
+    low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     with np.errstate(invalid="ignore"):
         shade = np.clip((high - depth) / max(high - low, 1e-6), 0.0, 1.0) * 200 + 30
-    grey = np.where(measured, shade, 0.0).astype(np.uint8)
+    grey = np.where(known, shade, 0.0).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)

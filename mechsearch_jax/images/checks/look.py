@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.images.cloud import BLOCK, View, above_board, shelf_view, thinned_view
 from mechsearch_jax.images.target_pixels import coloured_pixels
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf
 
 
@@ -23,12 +23,9 @@ class Look:
     """The images of one look, on the host.
 
     Attributes:
-      camera: of the images, with a pose without faults.
-      shelf: in its view.
-      depth: metres along the camera's z; 0 or NaN where nothing was measured.
-      colour: (h, w, 3), floats in 0 to 1 or uint8, if there is one.
-      mask: the object's number for each pixel, negative for none, if there is one.
-      detector: gives the target's pixels of a colour image; no target is looked for if None.
+      camera, shelf: of the images; the camera sees the shelf.
+      depth, colour, mask: as of a `Recogniser`.
+      detector: gives the target's pixels of a colour image; None if it is not told by its colour.
     """
 
     camera: Camera
@@ -40,44 +37,33 @@ class Look:
 
     @functools.cached_property
     def whole(self) -> Part:
-        """Every pixel that may show the shelf.
-
-        Raises:
-          InputError: the camera does not see the shelf.
-        """
+        """Every pixel that may show the shelf."""
         return Part(self, shelf_view(self.camera, self.shelf, 1, BLOCK))
 
     @functools.cached_property
     def thinned(self) -> Part:
-        """The pixels that recognition uses.
-
-        Raises:
-          InputError: the camera does not see the shelf.
-        """
+        """The pixels that recognition uses."""
         return Part(self, thinned_view(self.camera, self.shelf))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Part:
-    """The part of a look that a view shows."""
+    """What a view shows of a look; only with a colour image and a detector it has pixels of the target's colour."""
 
     look: Look
     view: View
 
     def of(self, image: np.ndarray) -> np.ndarray:
         """The view's pixels of a full image."""
-        v = self.view
-        rows, columns = (
-            slice(first, first + (count - 1) * v.stride + 1, v.stride)
-            for first, count in ((v.row, v.camera.height), (v.column, v.camera.width))
-        )
-        return np.asarray(image)[rows, columns]
+        camera, stride = self.view.camera, self.view.stride
+        part = image[self.view.row :: stride, self.view.column :: stride]
+        return part[: camera.height, : camera.width]
 
     @functools.cached_property
     def depth(self) -> Float[np.ndarray, "h w"]:
-        """Depth [m], float32; NaN where nothing was measured."""
+        """Depth [m]; NaN where nothing was measured."""
         part = self.of(self.look.depth).astype(np.float32)
-        return np.where(part > 0, part, np.nan)
+        return np.where(measured(part), part, np.float32(np.nan))
 
     @functools.cached_property
     def points(self) -> Float[np.ndarray, "h w 3"]:
@@ -91,9 +77,8 @@ class Part:
 
     @functools.cached_property
     def colour(self) -> Float[np.ndarray, "h w 3"]:
-        """Red, green and blue in 0 to 1, float32; the look must have a colour image."""
-        assert self.look.colour is not None
-        part = self.of(self.look.colour)
+        """Red, green and blue in 0 to 1."""
+        part = self.of(np.asarray(self.look.colour))
         return part.astype(np.float32) / np.float32(255.0 if part.dtype == np.uint8 else 1.0)
 
     @functools.cached_property
@@ -107,7 +92,7 @@ class Part:
         return np.asarray(self.look.detector(jnp.asarray(colour)))
 
     def elected(self, colour: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """The same by a vote among neighbours, which is slow, in the shelf's free space."""
+        """Those in the shelf's free space by a vote among neighbours, which is slow."""
         assert self.look.detector is not None
         chosen = coloured_pixels(self.look.detector, jnp.asarray(colour), jnp.asarray(self.depth))
         return np.asarray(chosen) & self.above_board

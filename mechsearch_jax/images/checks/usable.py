@@ -57,9 +57,11 @@ def _check_depth(depth: Any) -> None:
     values = _values(depth)
     if values is None:
         return
-    measured = values[np.isfinite(values) & (values > 0)]
-    if measured.size and np.median(measured) > 20:
-        raise InputError(f"depth image: its median is {np.median(measured):.0f}; give metres, not millimetres")
+    known = values[np.isfinite(values) & (values > 0)]
+    # The largest number may stand for what was not measured, or be a simulator's far plane.
+    known = known[known < known.max(initial=0.0)]
+    if known.size and np.median(known) > 20:
+        raise InputError(f"depth image: its median is {np.median(known):.0f}; give metres, not millimetres")
 
 
 def _check_colour(colour: Any) -> None:
