@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_mutated_files import program
 
-from mechsearch_jax.calibration.check import placement_faults
-from mechsearch_jax.calibration.fit import FEW_PIXELS, LEVER, check_in_sight, fit_shelf
+from mechsearch_jax.calibration.check import check_holds, check_in_sight, placement_faults
+from mechsearch_jax.calibration.fit import FEW_PIXELS, LEVER, fit_shelf
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.calibration.report import correction, report
 from mechsearch_jax.commands.cell.calibrate import _write_values
@@ -120,11 +120,58 @@ def test_what_is_not_determined_of_the_camera_is_printed_as_it_is_written():
     assert "turning the camera" not in text
 
 
+def spoilt(share, values):
+    """The example's depth with a share of its pixels scattered over it replaced by others [m]."""
+    rng = np.random.default_rng(0)
+    hit = (rng.random(DEPTH.shape) < share) & (DEPTH > 0)
+    return np.where(hit, rng.uniform(*values, DEPTH.shape), DEPTH).astype(np.float32)
+
+
+@pytest.mark.parametrize("values", [(65.535, 65.536), (100.0, 100.1), (-1.0, 0.0), (0.2, 4.0)])
+@pytest.mark.parametrize("pixels", [10**6, FEW_PIXELS])
+def test_pixels_that_are_far_off_move_nothing(values, pixels):
+    fit = fit_shelf(CAMERA, SHELF, spoilt(0.1, values), pixels)
+    distance, angle = between(fit.corrected, fit_shelf(CAMERA, SHELF, DEPTH, pixels).corrected)
+    assert distance < 0.0005
+    assert angle < 0.05
+    check_holds(fit, SHELF, spoilt(0.1, values))
+
+
+@pytest.mark.parametrize(
+    ("depth", "words"),
+    [
+        (spoilt(0.3, (0.2, 4.0)), "25% of what it shows through the shelf's opening is behind the shelf's faces"),
+        (DEPTH[:, ::-1].copy(), "28% of what it shows through the shelf's opening is behind the shelf's faces"),
+        (1.05 * DEPTH, "the upper board stays 18 mm outside of its place"),
+        (DEPTH[::-1, ::-1].copy(), "is upside down"),
+    ],
+)
+def test_a_camera_is_not_corrected_by_a_fit_that_does_not_hold(depth, words, tmp_path, monkeypatch):
+    np.save(tmp_path / "depth.npy", depth)
+    save_camera(CAMERA, tmp_path / "camera.json")
+    files = ("--depth", str(tmp_path / "depth.npy"), "--camera", str(tmp_path / "camera.json"))
+    (tmp_path / "out.json").write_text("mine")
+    code, said = program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "out.json"))
+    assert code != 0
+    assert words in said
+    assert len(said.strip().splitlines()) == 1
+    assert (tmp_path / "out.json").read_text() == "mine"
+
+
+def test_an_image_upside_down_for_its_camera_is_told_from_a_camera_that_hangs_upside_down():
+    hanging = off_by((0.0, 0.0, 0.0), np.array(CAMERA.rotation)[:, 2], 180.0)
+    upside_down = DEPTH[::-1, ::-1].copy()
+    assert placement_faults(hanging, SHELF, upside_down, CalibrationLimits()) == ()
+    for camera, depth in ((CAMERA, upside_down), (hanging, DEPTH)):
+        with pytest.raises(InputError, match=r"is upside down for this pose.*turn the images.*or the pose.*not both"):
+            placement_faults(camera, SHELF, depth, CalibrationLimits())
+
+
 def test_nothing_of_the_shelf_in_sight_is_said():
     fit = fit_shelf(CAMERA, SHELF, np.zeros_like(DEPTH))
     assert np.abs(fit.shift).max() == np.abs(fit.turn).max() == 0.0
     with pytest.raises(InputError, match="depth image: shows no face of the shelf"):
-        check_in_sight(fit)
+        check_in_sight(fit, SHELF, np.zeros_like(DEPTH))
 
 
 def test_a_wrong_measure_of_the_shelf_is_no_pose():

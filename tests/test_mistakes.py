@@ -1,16 +1,16 @@
 """Every mistake of the table in docs/commands.md is made here, and gets the message that the table states."""
 
 import dataclasses
+import functools
 import json
 import re
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from mechsearch_jax.calibration.check import placement_faults
-from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.images.image_files import (
     load_camera,
@@ -20,12 +20,12 @@ from mechsearch_jax.images.image_files import (
     save_camera,
     save_depth,
 )
-from mechsearch_jax.perception.plausibility import check_measured, colour_faults, identity_faults, image_faults
-from mechsearch_jax.perception.recogniser import check_images
+from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.faults import check_image
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
@@ -47,16 +47,13 @@ def look(depth=DEPTH, colour=COLOUR, mask=None, target_id=None, camera=CAMERA, s
     """
     check_camera(camera, shelf)
     images = converted(depth, colour, mask, target_id)
-    depth, colour, mask, target_id = images
-    check_images(camera, depth)
-    check_measured(camera, shelf, depth)
-    faults = [*camera_faults(camera, shelf), *placement_faults(camera, shelf, depth, CELL.calibration)]
-    check_images(camera, *images)
-    faults += image_faults(camera, shelf, depth, mask)
-    faults += identity_faults(colour, mask, target_id)
-    if colour is not None and target_id is None:
-        faults += colour_faults(camera, shelf, CELL.target, TargetColour.lit(), depth, colour)
-    return faults
+    setting = types.SimpleNamespace(camera=camera, shelf=shelf, target=CELL.target)
+    return [*camera_faults(camera, shelf), *check_image(setting, CELL.calibration, images, recogniser())[1]]
+
+
+@functools.cache
+def recogniser():
+    return Recogniser(types.SimpleNamespace(camera=CAMERA, shelf=SHELF, target=CELL.target))
 
 
 def posed(pose, **changes):

@@ -11,14 +11,13 @@ from published import published_scenarios
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.colour import RED, TargetColour
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import plausibility
 from mechsearch_jax.perception.plausibility import (
     EMPTY_SHELF,
-    NOTHING_MEASURED,
-    check_measured,
     colour_faults,
     detection_faults,
     identity_faults,
@@ -65,7 +64,7 @@ def sensed(scene, camera=CAMERA):
 )
 def test_a_shelf_elsewhere_is_said(by, words):
     x, y, z = by
-    faults = image_faults(CAMERA, SHELF.moved((-x, -y, -z)), sensed(SCENE)[0])
+    faults = image_faults(Look(CAMERA, SHELF.moved((-x, -y, -z)), sensed(SCENE)[0]))
     assert len(faults) == len(words)
     for fault, text in zip(faults, words, strict=True):
         assert fault.startswith("depth image: ")
@@ -73,19 +72,19 @@ def test_a_shelf_elsewhere_is_said(by, words):
 
 
 def test_one_5_mm_off_or_hardly_seen_is_not():
-    assert image_faults(CAMERA, SHELF, sensed(SCENE)[0]) == ()
-    assert image_faults(CAMERA, SHELF.moved((0.005, -0.005, 0.0)), sensed(SCENE)[0]) == ()
+    assert image_faults(look(sensed(SCENE)[0])) == ()
+    assert image_faults(Look(CAMERA, SHELF.moved((0.005, -0.005, 0.0)), sensed(SCENE)[0])) == ()
     # A wall of which nothing was measured is not looked for.
     depth = sensed(SCENE)[0].copy()
     points = np.asarray(back_project(CAMERA, jnp.asarray(depth)))
     depth[(points[..., 0] > SHELF.back - 0.03) & (points[..., 1] < 0.3)] = 0.0
-    (fault,) = image_faults(CAMERA, SHELF.moved((-0.02, 0.0, 0.0)), depth)
+    (fault,) = image_faults(Look(CAMERA, SHELF.moved((-0.02, 0.0, 0.0)), depth))
     assert "front edge" in fault
 
 
 def test_a_row_of_boxes_before_the_back_wall_is_not_the_wall():
     row = tuple(Body("box", (0.03, 0.078, 0.096), (0.735, y, 0.5005), (1.0, 0.0, 0.0, 0.0)) for y in (-0.1, 0.1, 0.3))
-    assert image_faults(CAMERA, SHELF, sensed(Scenario("row", row, SCENE.target))[0]) == ()
+    assert image_faults(look(sensed(Scenario("row", row, SCENE.target))[0])) == ()
 
 
 @pytest.mark.slow
@@ -94,8 +93,12 @@ def test_no_published_scene_is_said_to_be_wrong():
     for file in published_scenarios()[::5]:
         scene = load_scenario(file)
         depth, colour = sensed(scene)
-        assert image_faults(CAMERA, SHELF, depth) == ()
-        assert colour_faults(CAMERA, SHELF, TARGET, TargetColour.lit(), depth, colour) == ()
+        assert image_faults(look(depth)) == ()
+        assert colour_faults(look(depth, colour, detector=TargetColour.lit()), TARGET) == ()
+
+
+def look(depth, colour=None, **fields):
+    return Look(CAMERA, SHELF, depth, colour, **fields)
 
 
 def unseen(visible=False):
@@ -105,40 +108,44 @@ def unseen(visible=False):
 def test_things_of_the_targets_colour_that_are_not_the_target_are_said():
     depth, colour = sensed(IN_SIGHT)
     red, blue = TargetColour.lit(), TargetColour.lit((0.0, 0.0, 0.8))
-    (fault,) = detection_faults(CAMERA, SHELF, red, depth, colour, unseen())
+    (fault,) = detection_faults(look(depth, colour, detector=red), unseen())
     assert "pixels have the target's colour, but nothing that shows them has its shape and size" in fault
-    assert detection_faults(CAMERA, SHELF, red, depth, colour, unseen(visible=True)) == ()
-    assert detection_faults(CAMERA, SHELF, red, *sensed(SCENE), unseen()) == ()
-    assert len(detection_faults(CAMERA, SHELF, blue, depth, colour[..., ::-1], unseen())) == 1
+    assert detection_faults(look(depth, colour, detector=red), unseen(visible=True)) == ()
+    assert detection_faults(look(*sensed(SCENE), detector=red), unseen()) == ()
+    assert len(detection_faults(look(depth, colour[..., ::-1], detector=blue), unseen())) == 1
 
 
 def test_blue_green_red_is_said():
     depth, colour = sensed(IN_SIGHT)
     detector = TargetColour.lit()
-    assert colour_faults(CAMERA, SHELF, TARGET, detector, depth, colour) == ()
-    (fault,) = colour_faults(CAMERA, SHELF, TARGET, detector, depth, colour[..., ::-1])
+    assert colour_faults(look(depth, colour, detector=detector), TARGET) == ()
+    (fault,) = colour_faults(look(depth, colour[..., ::-1], detector=detector), TARGET)
     assert fault.startswith("colour image: looks like blue, green, red")
     floats = np.float32(colour[..., ::-1] / 255)
-    assert len(colour_faults(CAMERA, SHELF, TARGET, detector, depth, floats)) == 1
+    assert len(colour_faults(look(depth, floats, detector=detector), TARGET)) == 1
     # A hidden target leaves nothing to tell by, and another thing of the exchanged colour is not of its shape.
     hidden = sensed(SCENE)
-    assert colour_faults(CAMERA, SHELF, TARGET, detector, *hidden) == ()
+    assert colour_faults(look(*hidden, detector=detector), TARGET) == ()
     other = hidden[1].astype(np.float32) / 255
     image = np.asarray(observe(CAMERA, from_scenario(SCENE)).segmentation)
     for slot in range(len(SCENE.objects)):
         painted = np.where((image == slot)[..., None], RED[::-1], other).astype(np.float32)
-        assert colour_faults(CAMERA, SHELF, TARGET, detector, hidden[0], painted) == ()
+        assert colour_faults(look(hidden[0], painted, detector=detector), TARGET) == ()
 
 
 def test_what_keeps_the_target_from_being_recognised_is_named():
     mask = np.full((4, 4), -1)
     mask[0] = 3
-    (fault,) = identity_faults(None, None, None)
+
+    def faults(colour=None, mask=None, target_id=None):
+        return identity_faults(look(np.ones((4, 4)), colour, mask=mask), target_id)
+
+    (fault,) = faults()
     assert "give a colour image, or a mask with target_id" in fault
-    assert len(identity_faults(None, mask, None)) == 1
-    assert identity_faults(np.zeros((4, 4, 3)), None, None) == ()
-    assert identity_faults(None, mask, 3) == identity_faults(None, mask, -1) == ()
-    (fault,) = identity_faults(None, mask, 5)
+    assert len(faults(mask=mask)) == 1
+    assert faults(np.zeros((4, 4, 3))) == ()
+    assert faults(mask=mask, target_id=3) == faults(mask=mask, target_id=-1) == ()
+    (fault,) = faults(mask=mask, target_id=5)
     assert "no pixel holds the target's number 5" in fault
 
 
@@ -149,19 +156,17 @@ def nothing_seen():
 def test_an_empty_shelf_differs_from_one_on_which_nothing_is_recognised():
     bare = observe(CAMERA, from_scenario(SCENE).replace(valid=jnp.zeros(9, bool)))
     depth = np.asarray(bare.depth) + np.random.default_rng(0).normal(0, 0.001, bare.depth.shape).astype(np.float32)
-    assert sight_faults(CAMERA, SHELF, depth, nothing_seen()) == (EMPTY_SHELF,)
-    (fault,) = sight_faults(CAMERA, SHELF, sensed(SCENE)[0], nothing_seen())
+    assert sight_faults(look(depth), nothing_seen()) == (EMPTY_SHELF,)
+    (fault,) = sight_faults(look(sensed(SCENE)[0]), nothing_seen())
     assert "something stands on the shelf, but no object and no target is recognised" in fault
-    assert sight_faults(CAMERA, SHELF, depth, nothing_seen().replace(target_visible=jnp.array(True))) == ()
+    assert sight_faults(look(depth), nothing_seen().replace(target_visible=jnp.array(True))) == ()
 
 
-@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, -np.inf, 65.535, 1000.0])
 def test_an_image_without_a_measurement_is_said_and_refused(value):
     depth = np.full((CAMERA.height, CAMERA.width), value, np.float32)
-    assert image_faults(CAMERA, SHELF, depth) == (NOTHING_MEASURED,)
-    with pytest.raises(InputError, match="depth image: nothing was measured"):
-        check_measured(CAMERA, SHELF, depth)
-    check_measured(CAMERA, SHELF, sensed(SCENE)[0])
+    with pytest.raises(InputError, match="depth image: nothing was measured where it shows the shelf"):
+        image_faults(look(depth))
 
 
 def test_an_edge_that_the_image_cuts_off_is_not_the_boards():

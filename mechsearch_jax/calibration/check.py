@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.calibration.fit import FEW_PIXELS, REACH, FaceFit, ShelfFit, check_in_sight, check_size, fit_shelf
+from mechsearch_jax.calibration.fit import FEW_PIXELS, REACH, FaceFit, ShelfFit, fit_shelf
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import camera_faults
 
@@ -20,6 +20,11 @@ CERTAIN = 3.0
 # Of what is seen through the shelf's opening: least share near the shelf, and largest share farther behind its faces
 # than this [m]. The image is thinned for it, in pixels. A face should be in sight if more than this share ends on it.
 LEAST_INSIDE, MOST_BEHIND, BEHIND, THINNED, WELL_IN_SIGHT = 0.2, 0.05, 0.03, 8, 0.1
+# A fit does not hold with a larger share behind the faces, or if it leaves the face of most pixels, or another one,
+# farther from its place than this [m].
+MOST_OUTLIERS, MOST_OFF_LARGEST, MOST_OFF = 0.2, 0.005, 0.015
+# An image is upside down if turned it shows so many times as many pixels on the shelf's faces.
+CLEARLY = 3.0
 CAUSES = (
     "check whether the camera or the shelf was moved, the camera's pose and focal lengths, whether the image is "
     "turned, and the unit and scale of the depth (metres along the camera's axis)"
@@ -37,13 +42,12 @@ def placement_faults(
 
     Args:
       camera, shelf: as they are taken to be.
-      depth: along the camera's axis [m]; 0 or NaN where nothing was measured.
+      depth: an image that `check_images` was called with.
       limits: of shift and turn.
 
     Raises:
       InputError: it is so far off that the image cannot be used, or hardly anything of it is the shelf.
     """
-    check_size(camera, depth)
     opening = _opening(camera, shelf, depth)
     inside, behind = _shares(shelf, opening.points)
     if inside < LEAST_INSIDE:
@@ -55,9 +59,14 @@ def placement_faults(
     # A mistake that the pose alone gives away explains more.
     if (is_far or not any(part.patches for part in fit.faces)) and (faults := camera_faults(camera, shelf)):
         raise InputError(faults[0])
-    check_in_sight(fit)
+    if is_far:
+        check_upright(fit, shelf, depth)
+    check_in_sight(fit, shelf, depth)
     if is_far:
         raise InputError(f"{_appears(fit, shelf)}, which is too far to go on; {CAUSES}; {REMEDY}")
+    most = max(MOST_OFF, limits.refuse_shift)
+    if fault := _contradiction(fit, most, most):
+        raise InputError(f"depth image: the shelf does not fit it: {fault}; {CAUSES}, and the shelf's measures")
     faults = [_misplaced(part) for part in fit.faces if part.patches and abs(part.off) > limits.warn_shift]
     if is_beyond(fit, shelf, limits.warn_shift, limits.warn_turn):
         faults.insert(0, f"{_appears(fit, shelf)}: recognition is worse for it; {REMEDY}")
@@ -69,6 +78,70 @@ def placement_faults(
             f"faces; {CAUSES}, and the shelf's measures",
         )
     return _unseen(fit, shelf, opening)
+
+
+def check_in_sight(fit: ShelfFit, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> None:
+    """Check that an image determines anything.
+
+    Raises:
+      InputError: no face of the shelf is in sight.
+    """
+    if any(part.patches for part in fit.faces):
+        return
+    check_upright(fit, shelf, depth)
+    raise InputError(
+        f"depth image: shows no face of the shelf within {100 * REACH:.0f} cm of its place; check the unit of the "
+        "depth (metres along the camera's axis), whether the image is turned, the camera's pose and focal lengths, "
+        "and the shelf"
+    )
+
+
+def check_upright(fit: ShelfFit, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> None:
+    """Check that an image of which a fit is bad would not fit better upside down.
+
+    A camera may hang upside down: its pose alone does not tell.
+
+    Raises:
+      InputError: it would.
+    """
+    turned = fit_shelf(fit.camera, shelf, depth[::-1, ::-1], FEW_PIXELS)
+    seen, seen_turned = (sum(part.pixels for part in of.faces) for of in (fit, turned))
+    if seen_turned > CLEARLY * seen and not holding(turned, shelf, depth[::-1, ::-1]):
+        raise InputError(
+            "depth image: is upside down for this pose of the camera: turn the images by 180 degrees, or the pose "
+            "about the camera's axis (negate the first two columns of the rotation), not both"
+        )
+
+
+def check_holds(fit: ShelfFit, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> None:
+    """Check that a fit explains its image, so that a camera may be corrected by it.
+
+    Raises:
+      InputError: it does not.
+    """
+    if fault := holding(fit, shelf, depth):
+        check_upright(fit, shelf, depth)
+        raise InputError(f"depth image: the shelf does not fit it: {fault}; {CAUSES}, and the shelf's measures")
+
+
+def _contradiction(fit: ShelfFit, largest: float, others: float) -> str | None:
+    """The face that a fit leaves farther from its place than these [m], the one of most pixels or another, in words.
+
+    The fit ended between faces that contradict each other, or has not reached the only one.
+    """
+    seen = sorted((part for part in fit.faces if part.patches), key=lambda part: -part.pixels)
+    for part, most in zip(seen, (largest, *[others] * 4), strict=False):
+        if abs(part.off) > most:
+            return f"the {part.face.name} stays {1000 * abs(part.off):.0f} mm {part.side} of its place"
+    return None
+
+
+def holding(fit: ShelfFit, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> str | None:
+    """What speaks against a fit; None if nothing does."""
+    _, behind = _shares(shelf, _opening(fit.corrected, shelf, depth).points)
+    if behind > MOST_OUTLIERS:
+        return f"{100 * behind:.0f}% of what it shows through the shelf's opening is behind the shelf's faces"
+    return _contradiction(fit, MOST_OFF_LARGEST, MOST_OFF)
 
 
 class _Opening(NamedTuple):
@@ -85,8 +158,8 @@ def _opening(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> _
     v, u = np.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
     ways = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.array(camera.rotation).T
     seen, place = np.asarray(depth[np.ix_(rows, columns)], float).ravel(), np.array(camera.position)
-    measured = np.isfinite(seen) & (seen > 0)
-    ways, points = ways[measured], place + seen[measured, None] * ways[measured]
+    known = np.isfinite(seen) & measured(seen)
+    ways, points = ways[known], place + seen[known, None] * ways[known]
     low, high = _corners(shelf)
     to_front = (shelf.front - place[0]) / np.where(ways[:, 0] > 1e-6, ways[:, 0], np.inf)
     entry = place + to_front[:, None] * ways

@@ -23,7 +23,6 @@ from mechsearch_jax.calibration.faces import FACES, Face
 from mechsearch_jax.calibration.patches import flat_patches
 from mechsearch_jax.images.camera_pose import with_pose
 from mechsearch_jax.images.cloud import middle
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -113,45 +112,15 @@ class _Matched(NamedTuple):
     weights: np.ndarray
 
 
-def check_size(camera: Camera, depth: np.ndarray) -> None:
-    """Check that a depth image has the camera's size.
-
-    Raises:
-      InputError: it has another.
-    """
-    size = (camera.height, camera.width)
-    if depth.shape != size:
-        turned = "; it looks transposed" if depth.shape == size[::-1] else ""
-        raise InputError(f"depth image: its shape is {depth.shape}, the camera's images are {size}{turned}")
-
-
-def check_in_sight(fit: ShelfFit) -> None:
-    """Check that an image determines anything.
-
-    Raises:
-      InputError: no face of the shelf is in sight.
-    """
-    if not any(part.patches for part in fit.faces):
-        raise InputError(
-            f"depth image: shows no face of the shelf within {100 * REACH:.0f} cm of its place; check the unit of the "
-            "depth (metres along the camera's axis), whether the image is turned, the camera's pose and focal lengths, "
-            "and the shelf"
-        )
-
-
 def fit_shelf(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], most: int = ALL_PIXELS) -> ShelfFit:
     """Fit the shelf's faces to a depth image.
 
     Args:
       camera: as it is taken to be, at most some 10 cm and 15 degrees off.
       shelf: as it is taken to be.
-      depth: along the camera's axis [m]; 0 or NaN where nothing was measured.
+      depth: an image that `check_images` was called with.
       most: pixels that are used.
-
-    Raises:
-      InputError: the image has another size than the camera's.
     """
-    check_size(camera, depth)
     patches = flat_patches(camera, depth, most)
     pivot = np.array(middle(shelf), float)
     rotation, place = np.array(camera.rotation, float), np.array(camera.position, float)

@@ -1,7 +1,9 @@
 """Flat patches of a depth image: small blocks of pixels, each with a point and a normal.
 
 Of a plane, the inverse of the depth is linear in the coordinates of a pixel: a patch is one linear least-squares fit,
-which averages the noise of its pixels. Blocks across an edge or on a curved surface are not flat, and are left out.
+which averages the noise of its pixels, without those far from a plane through medians (P. Rousseeuw and A. Leroy,
+"Robust regression and outlier detection", 1987): one pixel that is metres off would spoil its whole block. Blocks
+across an edge or on a curved surface are not flat, and are left out.
 """
 
 from __future__ import annotations
@@ -12,12 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, measured
 
 # Side of a block in pixels of the thinned image.
 SIDE = 8
 # Least share of a block's pixels with a depth.
 LEAST_MEASURED = 0.2
+# A pixel counts that is off by at most so many standard deviations of its block, by their median, and this [m]; at
+# least this share of a block's measured pixels must count.
+NEAR, LEAST_NEAR, LEAST_COUNTED = 4.0, 0.0005, 0.75
 # A block is flat if its depth deviates from a plane by at most so many times the median of all blocks, and this [m].
 FLATNESS, LEAST_DEVIATION = 2.0, 0.0005
 
@@ -41,7 +46,7 @@ def flat_patches(camera: Camera, depth: Float[np.ndarray, "h w"], most: int) -> 
 
     Args:
       camera: of the image.
-      depth: along the camera's axis [m]; not finite or not positive where nothing was measured.
+      depth: along the camera's axis [m].
       most: the image is thinned to at most about so many pixels.
     """
     stride = max(1, round(math.sqrt(depth.size / most)))
@@ -49,9 +54,9 @@ def flat_patches(camera: Camera, depth: Float[np.ndarray, "h w"], most: int) -> 
     rows, columns = (size // SIDE for size in thin.shape)
     blocks = thin[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE).swapaxes(1, 2)
     blocks = blocks.reshape(rows * columns, SIDE**2)
-    measured = np.isfinite(blocks) & (blocks > 0)
-    enough = measured.sum(axis=1) >= max(LEAST_MEASURED * SIDE**2, 4)
-    blocks, measured = blocks[enough], measured[enough]
+    is_measured = np.isfinite(blocks) & measured(blocks)
+    enough = is_measured.sum(axis=1) >= max(LEAST_MEASURED * SIDE**2, 4)
+    blocks, is_measured = blocks[enough], is_measured[enough]
     # The middle of each block in the image, at unit depth.
     place = (np.arange(rows), np.arange(columns))
     down, across = ((p * SIDE + (SIDE - 1) / 2.0) * stride + 0.5 for p in place)
@@ -61,15 +66,41 @@ def flat_patches(camera: Camera, depth: Float[np.ndarray, "h w"], most: int) -> 
     offset = (np.arange(SIDE) - (SIDE - 1) / 2.0) * stride
     v, u = np.meshgrid(offset / camera.fy, offset / camera.fx, indexing="ij")
     basis = np.stack([u.ravel(), v.ravel(), np.ones(SIDE**2)], axis=1)
-    weight = measured.astype(float)
-    inverse = np.where(measured, 1.0 / np.where(measured, blocks, 1.0), 0.0)
+    inverse = np.where(is_measured, 1.0 / np.where(is_measured, blocks, 1.0), np.nan)
+    slopes = _plane_of_medians(inverse, v, u)
+    off = np.abs(inverse - slopes @ basis.T) / np.maximum(slopes[:, 2:], 1e-6) ** 2
+    counted = off <= NEAR * 1.4826 * _median(off) + LEAST_NEAR
+    enough = counted.sum(axis=1) >= LEAST_COUNTED * is_measured.sum(axis=1)
+    weight, inverse = counted.astype(float), np.where(counted, inverse, 0.0)
     products = (basis[:, :, None] * basis[:, None, :]).reshape(SIDE**2, 9)
     matrix, right = (weight @ products).reshape(-1, 3, 3), inverse @ basis
     # A block whose pixels lie on a line has no plane.
-    solid = np.linalg.cond(matrix * np.outer(*[1.0 / np.sqrt(np.diag(basis.T @ basis))] * 2)) < 1e4
+    solid = enough & (np.linalg.cond(matrix * np.outer(*[1.0 / np.sqrt(np.diag(basis.T @ basis))] * 2)) < 1e4)
     slopes = np.zeros_like(right)
     slopes[solid] = np.linalg.solve(matrix[solid], right[solid][..., None])[..., 0]
     return _flat(middle, slopes, inverse, weight, basis, solid, stride)
+
+
+def _median(values: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n 1"]:
+    """The lower median of each row's finite values; NaN without any."""
+    middle = np.maximum(np.isfinite(values).sum(axis=1, keepdims=True) - 1, 0) // 2
+    # NaN is sorted last.
+    return np.take_along_axis(np.sort(values, axis=1), middle, axis=1)
+
+
+def _plane_of_medians(
+    inverse: Float[np.ndarray, "n p"], v: Float[np.ndarray, "s s"], u: Float[np.ndarray, "s s"]
+) -> Float[np.ndarray, "n 3"]:
+    """Slopes of blocks' inverse depths along u and v, and those at their middles, by the medians of differences.
+
+    Args:
+      inverse: depth of the pixels, NaN where not measured.
+      v, u: of the pixels at unit depth.
+    """
+    square, half = inverse.reshape(-1, SIDE, SIDE), SIDE // 2
+    across = _median((square[:, :, half:] - square[:, :, :half]).reshape(len(inverse), -1)) / (u[0, half] - u[0, 0])
+    down = _median((square[:, half:] - square[:, :half]).reshape(len(inverse), -1)) / (v[half, 0] - v[0, 0])
+    return np.hstack([across, down, _median(inverse - across * u.ravel() - down * v.ravel())])
 
 
 def _flat(
@@ -93,7 +124,7 @@ def _flat(
       stride: thinning of the image.
     """
     count = weight.sum(axis=1)
-    centre = weight @ basis[:, :2] / count[:, None]
+    centre = weight @ basis[:, :2] / np.maximum(count, 1)[:, None]
     at_centre = np.sum(slopes[:, :2] * centre, axis=1) + slopes[:, 2]
     solid = solid & (at_centre > 1e-3)
     safe = np.where(solid, at_centre, 1.0)

@@ -50,6 +50,8 @@ def load_depth(path: PathLike) -> Float[np.ndarray, "h w"]:
     if image.dtype.kind == "f":
         return image.astype(np.float32)
     if image.dtype.kind in "iu" and image.dtype.itemsize > 1:
+        # Cameras and simulators write the largest number of the type, too, where they measure nothing.
+        image = np.where(image == np.iinfo(image.dtype).max, 0, image)
         return image.astype(np.float32) * np.float32(MILLIMETRE)
     raise InputError(
         f"{path}: holds {image.dtype}; a depth image has 16 bits in millimetres, or floats in metres (.npy, .tiff)"

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.cloud import View
 from mechsearch_jax.runtime.compiled import kept
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.detector import longer
 
 # How much coarser than an image of 1280 x 720 shares are counted; with other images scaled like f's own image.
@@ -33,16 +33,16 @@ def measured_share(camera: Camera, view: View, depth: Float[Array, "h w"]) -> Fl
     Args:
       camera: of the full image.
       view: the rays of it that `depth` has.
-      depth: along the camera's z [m]; NaN or 0 where nothing was measured, infinite where nothing is.
+      depth: along the camera's z [m]; see `camera.measured`.
     """
     step = share_step(camera)
-    measured = (depth > 0.0).astype(jnp.float32)
+    there = measured(depth).astype(jnp.float32)
     rows, columns = camera.height // step, camera.width // step
     at_rows, near_rows = _blocks(rows, step, view.row, view.stride, depth.shape[0])
     at_columns, near_columns = _blocks(columns, step, view.column, view.stride, depth.shape[1])
-    seen = jnp.matmul(jnp.matmul(at_rows, measured, precision="highest"), at_columns.T, precision="highest")
+    seen = jnp.matmul(jnp.matmul(at_rows, there, precision="highest"), at_columns.T, precision="highest")
     count = jnp.sum(at_rows, axis=1)[:, None] * jnp.sum(at_columns, axis=1)[None]
-    return jnp.where(count > 0.0, seen / jnp.maximum(count, 1.0), measured[near_rows][:, near_columns])
+    return jnp.where(count > 0.0, seen / jnp.maximum(count, 1.0), there[near_rows][:, near_columns])
 
 
 def _blocks(

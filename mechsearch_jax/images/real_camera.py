@@ -20,12 +20,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.camera_pose import PoseConfig, PoseEstimate, estimate_pose
+from mechsearch_jax.images.checks.usable import check_images
 from mechsearch_jax.images.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
 from mechsearch_jax.images.target_pixels import evened
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf
 
 _evened = jax.jit(evened)
@@ -105,24 +106,16 @@ class PreparedImage(flax.struct.PyTreeNode):
 
 def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     """The depth image with NaN where nothing was measured."""
-    size = (camera.height, camera.width)
-    for name, image, shape in (("depth", depth, size), ("colour", colour, (*size, 3)), ("mask", mask, size)):
-        if image is not None and image.shape != shape:
-            raise InputError(f"{name} image: its shape is {image.shape}, the camera's images are {shape}")
-    if colour.dtype.kind != "f" or not np.all((colour >= 0) & (colour <= 1)):
+    # Numbers of no segment are allowed here.
+    check_images(camera, depth, colour, None if mask is None else np.clip(mask, OTHER, 0))
+    if colour.dtype == np.uint8:
         raise InputError("colour image: must be floats from 0 to 1; divide 8-bit values by 255")
-    if mask is not None and mask.dtype.kind not in "iu":
-        raise InputError(f"mask image: must hold whole numbers, -1 for no object, not {mask.dtype}")
-    measured = np.isfinite(depth) & (depth > 0)
-    if not measured.any():
+    known = np.isfinite(depth) & measured(depth)
+    if not known.any():
         raise InputError(
             "depth image: nothing was measured: no positive depth; it must be in metres along the camera's axis"
         )
-    if np.median(depth[measured]) > 20:
-        raise InputError(
-            f"depth image: its median is {np.median(depth[measured]):.0f}; it must be in metres, not millimetres"
-        )
-    return np.where(measured, depth, np.nan).astype(np.float32)
+    return np.where(known, depth, np.nan).astype(np.float32)
 
 
 def _fixed(rng: np.random.Generator, points: np.ndarray, count: int) -> tuple[Array, Array]:

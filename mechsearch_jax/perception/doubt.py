@@ -19,7 +19,7 @@ from mechsearch_jax.perception.recogniser import Setting
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.parts import parts_of
 from mechsearch_jax.shapes.solid import Solid
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -173,9 +173,9 @@ def recognition_doubt(
     if np.shape(depth) != (camera.height, camera.width):
         raise InputError(f"depth image: its shape is {np.shape(depth)}, not {(camera.height, camera.width)}")
     rays, depths = _seen(camera, shelf, np.asarray(depth, float))
-    measured = depths > 0.0
-    missing = 1.0 - float(measured.mean()) if len(measured) else 1.0
-    rays, depths = rays[measured], depths[measured]
+    known = measured(depths)
+    missing = 1.0 - float(known.mean()) if len(known) else 1.0
+    rays, depths = rays[known], depths[known]
     finite = np.isfinite(depths)
     origin = np.array(camera.position, float)
     points = origin + depths[finite, None] * rays[finite]

@@ -5,22 +5,22 @@ On the host, before recognition: otherwise wrong units, poses and masks end in a
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from mechsearch_jax.images.cloud import BLOCK, above_board, shelf_view, thinned_view
+from mechsearch_jax.calibration.faces import FACES, Face
+from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.planes import PlaneConfig, find_plane
-from mechsearch_jax.images.target_pixels import coloured_pixels, fitted_pose
+from mechsearch_jax.images.target_pixels import fitted_pose
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, back_project, project
+from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -53,66 +53,31 @@ SOMETHING = 100
 PATCH_SHARE, PATCH_DISTANCE = 0.85, 0.003
 PATCH_PIXELS = (0.4, 1.6)
 
-
-NOTHING_MEASURED = (
-    "depth image: nothing was measured where it shows the shelf; it must hold metres along the camera's axis, and the "
-    "sensor must be able to see the shelf"
-)
 EMPTY_SHELF = "the shelf is empty: no object and no target is seen"
 
 
-@dataclasses.dataclass(frozen=True)
-class Wall:
-    """A vertical face of a shelf.
-
-    Attributes:
-      name: in messages.
-      face: name of the `Shelf`'s field that gives its place.
-      axis: of that field: 0 for x, 1 for y.
-      outward: 1 if larger coordinates are outside the shelf, -1 if smaller ones are.
-    """
-
-    name: str
-    face: str
-    axis: int
-    outward: int
+WALLS = tuple(face for face in FACES if face.axis != 2)
 
 
-WALLS = (
-    Wall("the back wall", "back", 0, 1),
-    Wall("the right side wall", "right", 1, -1),
-    Wall("the left side wall", "left", 1, 1),
-)
-
-
-def image_faults(
-    camera: Camera,
-    shelf: Shelf,
-    depth: Float[np.ndarray, "h w"],
-    mask: Int[np.ndarray, "h w"] | None = None,
-) -> tuple[str, ...]:
+def image_faults(look: Look) -> tuple[str, ...]:
     """Warnings about a depth image and a mask that do not fit camera and shelf.
 
-    Args:
-      camera: of the images, with a pose without faults.
-      shelf: in its view.
-      depth: metres along the camera's z; 0 or NaN where nothing was measured.
-      mask: the object's number for each pixel, negative for none.
-
     Raises:
-      InputError: the camera does not see the shelf.
+      InputError: nothing was measured, or the camera does not see the shelf.
     """
-    view = shelf_view(camera, shelf, 1, BLOCK)
-    part = np.asarray(view.of(jnp.asarray(depth)), np.float32)
-    measured = np.isfinite(part) & (part > 0)
+    camera, shelf, mask = look.camera, look.shelf, look.mask
+    measured = np.isfinite(look.whole.depth)
     if not measured.any():
-        return (NOTHING_MEASURED,)
+        raise InputError(
+            "depth image: nothing was measured where it shows the shelf; it must hold metres along the camera's axis, "
+            "and the sensor must be able to see the shelf"
+        )
     if measured.mean() < LEAST_MEASURED:
         return (
             f"depth image: {100 * measured.mean():.0f}% of the pixels that show the shelf have a depth; it must be in "
             "metres along the camera's axis, and the sensor must be able to see the shelf",
         )
-    points = np.asarray(back_project(view.camera, jnp.asarray(np.where(measured, part, np.nan))))[measured]
+    points = look.whole.points[measured]
     floor = _floor_fault(shelf, points)
     # If the board is not at its place, the walls are not either.
     walls = [_edge_fault(camera, shelf, points), *(_wall_fault(shelf, wall, points) for wall in WALLS)]
@@ -151,12 +116,12 @@ def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
     )
 
 
-def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> str | None:
+def _wall_fault(shelf: Shelf, wall: Face, points: Float[np.ndarray, "n 3"]) -> str | None:
     """A warning if the points show a wall at another place; None if they show too little of it.
 
     The wall is the farthest plane with many points that is wider than any object.
     """
-    past, sideways = wall.outward * (points[:, wall.axis] - getattr(shelf, wall.face)), points[:, 1 - wall.axis]
+    past, sideways = -wall.height(shelf, points), points[:, 1 - wall.axis]
     low, high = (shelf.right, shelf.left) if wall.axis == 0 else (shelf.front, shelf.back)
     between = (sideways > low + WALL_MARGIN) & (sideways < high - WALL_MARGIN)
     upright = (points[:, 2] > shelf.board + WALL_MARGIN) & (points[:, 2] < shelf.ceiling - WALL_MARGIN)
@@ -189,12 +154,12 @@ def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> s
     if abs(off) <= FLOOR_TOLERANCE:
         return None
     return (
-        f"depth image: {wall.name} appears {100 * abs(off):.1f} cm {_way(wall, off)} than shelf.{wall.face} says; "
+        f"depth image: the {wall.name} appears {100 * abs(off):.1f} cm {_way(wall, off)} than shelf.{wall.field} says; "
         f"check the place of the shelf in {'xy'[wall.axis]} and the pose of the camera"
     )
 
 
-def _way(wall: Wall, off: float) -> str:
+def _way(wall: Face, off: float) -> str:
     if wall.axis == 0:
         return "farther" if off > 0 else "nearer"
     return "farther out" if off > 0 else "farther in"
@@ -204,11 +169,11 @@ def _edge_fault(camera: Camera, shelf: Shelf, points: Float[np.ndarray, "n 3"]) 
     """A warning if the points show the board's front edge at another place; None if they show too little of it."""
     x, y, z = points.T
     board = (np.abs(z - shelf.board) < 0.008) & (np.abs(x - shelf.front) < 2 * WALL_SEARCH)
-    across = (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
-    strip = ((y - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
+    board &= (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
+    x, strip = x[board], ((y[board] - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
     firsts = []
     for i in np.flatnonzero(_edge_in_image(camera, shelf)):
-        in_strip = x[board & across & (strip == i)]
+        in_strip = x[strip == i]
         if len(in_strip) >= 10:
             # Not the minimum: at an edge a sensor may measure a mixture of both depths.
             firsts.append(np.percentile(in_strip, 2))
@@ -233,69 +198,48 @@ def _edge_in_image(camera: Camera, shelf: Shelf) -> Bool[np.ndarray, " strips"]:
     return inside & (depth > 0)
 
 
-def identity_faults(
-    colour: np.ndarray | None, mask: Int[np.ndarray, "h w"] | None, target_id: int | None
-) -> tuple[str, ...]:
+def identity_faults(look: Look, target_id: int | None) -> tuple[str, ...]:
     """Warnings about images in which the target cannot be identified.
 
     Args:
-      colour: the colour image, if there is one.
-      mask: the object's number for each pixel, if there is one.
+      look: the images.
       target_id: the target's number in the mask, if given; negative if the mask does not show it.
     """
-    if colour is None and target_id is None:
+    if look.colour is None and target_id is None:
         return (
             "images: the target cannot be told from the objects; give a colour image, or a mask with target_id "
             "(negative where it does not show the target)",
         )
-    if mask is not None and target_id is not None and int(target_id) >= 0 and not (mask == int(target_id)).any():
+    if look.mask is not None and target_id is not None and target_id >= 0 and not (look.mask == target_id).any():
         return (
-            f"mask: no pixel holds the target's number {int(target_id)}, and the target counts as not seen; give the "
+            f"mask: no pixel holds the target's number {target_id}, and the target counts as not seen; give the "
             "number that the mask has for it, or a negative one where it does not show it",
         )
     return ()
 
 
-def colour_faults(
-    camera: Camera,
-    shelf: Shelf,
-    target: Target,
-    detector: Callable[[jax.Array], jax.Array],
-    depth: Float[np.ndarray, "h w"],
-    colour: np.ndarray,
-) -> tuple[str, ...]:
+def colour_faults(look: Look, target: Target) -> tuple[str, ...]:
     """A warning if a colour image seems to have red and blue exchanged.
 
     Args:
-      camera, shelf, target: of the image.
-      detector: gives the target's pixels of a colour image.
-      depth: as in `image_faults`.
-      colour: (h, w, 3), floats in 0 to 1 or uint8.
+      look: images with colour, and a detector.
+      target: which is looked for.
 
     Raises:
       InputError: the camera does not see the shelf.
     """
-    view = thinned_view(camera, shelf)
-    seen = np.asarray(view.of(jnp.asarray(depth, jnp.float32)))
-    seen = jnp.asarray(np.where(seen > 0, seen, np.nan))
-    points = back_project(view.camera, seen)
-    pixels = np.asarray(view.of(jnp.asarray(colour)))
-    image = pixels.astype(np.float32) / (255.0 if pixels.dtype == np.uint8 else 1.0)
-    inside = above_board(shelf, points)
-    least = SOMETHING * camera.width * camera.height / (1280 * 720 * view.stride**2)
-
-    def detected(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
-        return np.asarray(detector(jnp.asarray(image)) & inside)
-
-    exchanged = image[..., ::-1]
-    if detected(image).sum() > least or detected(exchanged).sum() <= least:
+    part, shelf = look.thinned, look.shelf
+    least = SOMETHING * found_pixels(look.camera, 1) / part.view.stride**2
+    exchanged = part.colour[..., ::-1]
+    if (part.detected & part.above_board).sum() > least or (part.judged(exchanged) & part.above_board).sum() <= least:
         return ()
-    swapped = np.asarray(coloured_pixels(detector, jnp.asarray(exchanged), seen) & inside)
+    swapped = part.elected(exchanged)
     if swapped.sum() <= least:
         return ()
-    pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, seen, jnp.asarray(swapped))
-    from_target = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
-    whole = 2 * target.half_size[0] * target.tall * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2
+    camera, points, depth = part.view.camera, jnp.asarray(part.points), jnp.asarray(part.depth)
+    pose, _ = fitted_pose(jax.random.key(0), target, shelf, camera, points, depth, jnp.asarray(swapped))
+    from_target = np.abs(np.asarray(distance(target, shelf, pose, points[jnp.asarray(swapped)])))
+    whole = 2 * target.half_size[0] * target.tall * (camera.fx / float(np.median(part.depth[swapped]))) ** 2
     as_large = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
     if not as_large or (from_target < PATCH_DISTANCE).mean() < PATCH_SHARE:
         return ()
@@ -305,50 +249,24 @@ def colour_faults(
     )
 
 
-def detection_faults(
-    camera: Camera,
-    shelf: Shelf,
-    detector: Callable[[jax.Array], jax.Array],
-    depth: Float[np.ndarray, "h w"],
-    colour: np.ndarray,
-    observation: Observation,
-) -> tuple[str, ...]:
+def detection_faults(look: Look, observation: Observation) -> tuple[str, ...]:
     """A warning if things have the target's colour, and none of them is taken for the target.
 
     Args:
-      camera, shelf, detector, depth, colour: as in `colour_faults`.
+      look: images with colour, and a detector.
       observation: of these images, without batch axes.
     """
     if bool(observation.target_visible):
         return ()
-    view = thinned_view(camera, shelf)
-    seen = np.asarray(view.of(jnp.asarray(depth, jnp.float32)))
-    seen = jnp.asarray(np.where(seen > 0, seen, np.nan))
-    pixels = np.asarray(view.of(jnp.asarray(colour)))
-    image = jnp.asarray(pixels.astype(np.float32) / (255.0 if pixels.dtype == np.uint8 else 1.0))
-    inside = above_board(shelf, back_project(view.camera, seen))
-    least = found_pixels(camera) / view.stride**2
+    part = look.thinned
+    least = found_pixels(look.camera) / part.view.stride**2
     # The vote among neighbours is slow, and needless where next to nothing has the colour.
-    if not bool(jnp.sum(detector(image) & inside) > least):
-        return ()
-    count = int(jnp.sum(coloured_pixels(detector, image, seen) & inside))
-    if count <= least:
+    if (part.detected & part.above_board).sum() <= least or (count := part.elected(part.colour).sum()) <= least:
         return ()
     return (
-        f"colour image: {count * view.stride**2} pixels have the target's colour, but nothing that shows them has its "
-        "shape and size; if the target is among them, check [target] and the camera's pose",
+        f"colour image: {count * part.view.stride**2} pixels have the target's colour, but nothing that shows them has "
+        "its shape and size; if the target is among them, check [target] and the camera's pose",
     )
-
-
-def check_measured(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> None:
-    """Check that a depth image has measurements where it shows the shelf; arguments as in `image_faults`.
-
-    Raises:
-      InputError: nothing was measured, or the camera does not see the shelf.
-    """
-    part = np.asarray(shelf_view(camera, shelf, 1).of(jnp.asarray(depth)))
-    if not (np.isfinite(part) & (part > 0)).any():
-        raise InputError(NOTHING_MEASURED)
 
 
 def shows_nothing(observation: Observation) -> bool:
@@ -356,21 +274,12 @@ def shows_nothing(observation: Observation) -> bool:
     return not (bool(jnp.any(observation.objects.valid)) or bool(observation.target_visible))
 
 
-def sight_faults(
-    camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], observation: Observation
-) -> tuple[str, ...]:
-    """Why an observation is empty, in one line; nothing if anything was recognised.
-
-    Args:
-      camera, shelf, depth: as in `image_faults`.
-      observation: without batch axes.
-    """
+def sight_faults(look: Look, observation: Observation) -> tuple[str, ...]:
+    """Why an observation, without batch axes, is empty, in one line; nothing if anything was recognised."""
     if not shows_nothing(observation):
         return ()
-    view = thinned_view(camera, shelf)
-    part = np.asarray(view.of(jnp.asarray(depth, jnp.float32)))
-    points = back_project(view.camera, jnp.asarray(np.where(part > 0, part, np.nan)))
-    standing = int(jnp.sum(above_board(shelf, points, FLOOR_TOLERANCE))) * view.stride**2
-    if standing > SOMETHING * camera.width * camera.height / (1280 * 720):
+    part = look.thinned
+    standing = int(jnp.sum(above_board(look.shelf, jnp.asarray(part.points), FLOOR_TOLERANCE))) * part.view.stride**2
+    if standing > SOMETHING * found_pixels(look.camera, 1):
         return ("recognition: something stands on the shelf, but no object and no target is recognised",)
     return (EMPTY_SHELF,)

@@ -12,10 +12,9 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.images.checks.usable import check_images
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection
@@ -30,8 +29,7 @@ from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
@@ -176,8 +174,8 @@ class Recogniser:
 
         Args:
           key: PRNG key of the drawn points.
-          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured, infinite where there is
-            nothing for at least 3 m.
+          depth: float (H, W), metres along the camera's z; 0, NaN or 65.535 where nothing was measured, infinite where
+            there is nothing for at least 3 m.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to 8, or
             OTHER (-1), FREE (-2) or MISSING (-3) of `images.labels`. Points on the shelf's faces always count as FREE.
@@ -189,8 +187,15 @@ class Recogniser:
         Raises:
           InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
-        fitted, visible, measured = self.fitted(key, depth, colour, mask, target_id)
-        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, measured)
+        check_images(self.camera, depth, colour, mask, target_id)
+        return self.unchecked(key, depth, colour, mask, target_id)
+
+    def unchecked(
+        self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
+    ) -> Observation:
+        """The same of images that `check_images` was called with before."""
+        fitted, visible, share = self.fitted(key, depth, colour, mask, target_id)
+        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, share)
 
     def fitted(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
@@ -199,18 +204,14 @@ class Recogniser:
         the share of the full image that was measured, see `images.measured.measured_share`.
 
         Args:
-          key, depth, colour, mask, target_id: as above.
-
-        Raises:
-          InputError: as above.
+          key, depth, colour, mask, target_id: as above; they are not checked.
         """
-        check_images(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
-        image, visible, measured = _labelled(self, keys[0], depth, colour, mask, target_id)
+        image, visible, share = _labelled(self, keys[0], depth, colour, mask, target_id)
         fitter = self.fitter if mask is None else self.mask_fitter
         settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
         unseen = found_pixels(self.camera) / self.view.stride**2
-        return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible, measured
+        return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible, share
 
 
 def _as_pytree(slot: Any) -> Any:
@@ -225,7 +226,7 @@ def _labelled(
     """The shelf's part of the image with labels, whether the target is visible in it, and what of it was measured."""
     camera, view, shelf = recogniser.camera, recogniser.view, recogniser.shelf
     seen = view.of(jnp.asarray(depth, jnp.float32))
-    seen = jnp.where(seen > 0.0, seen, jnp.nan)
+    seen = jnp.where(measured(seen), seen, jnp.nan)
     points = back_project(view.camera, seen)
 
     # Points on the board's faces may be the target's.
@@ -299,73 +300,3 @@ def _labels(
     labels = jnp.where(above_board(shelf, points), body, jnp.where(before, OTHER, FREE))
     missing = ~jnp.isfinite(points).all(axis=-1) | (instances == MISSING)
     return jnp.where(missing, MISSING, labels).astype(jnp.int8)
-
-
-def check_images(camera: Camera, depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None) -> None:
-    """Check the images that a `Recogniser` is called with.
-
-    Raises:
-      InputError: one of them has the wrong shape, type or unit. Values are checked outside `jit` only.
-    """
-    size = (camera.height, camera.width)
-    for name, image, shape in (("depth", depth, size), ("colour", colour, (*size, 3)), ("mask", mask, size)):
-        if image is None and name != "depth":
-            continue
-        if image is None or not (hasattr(image, "shape") and hasattr(image, "dtype")):
-            raise InputError(f"{name} image: is a {type(image).__name__}; give an array of the shape {shape}")
-        if tuple(image.shape) != shape:
-            turned = "; it looks transposed" if tuple(image.shape[:2]) == size[::-1] else ""
-            raise InputError(
-                f"{name} image: its shape is {tuple(image.shape)}, the camera's images are {shape}{turned}"
-            )
-    _check_depth(depth)
-    if colour is not None:
-        _check_colour(colour)
-    if target_id is not None:
-        if mask is None:
-            raise InputError("target_id: names a number of a mask; give the mask too, or leave it out")
-        if not jnp.issubdtype(jnp.result_type(target_id), jnp.integer) or jnp.ndim(target_id) != 0:
-            raise InputError(f"target_id: {target_id} must be one whole number, that of the target in the mask")
-    if mask is not None:
-        _check_mask(mask, colour is None and target_id is None)
-
-
-def _values(image: Any) -> np.ndarray | None:
-    """Every eighth row and column, for checks of the values; None while JAX traces."""
-    return None if isinstance(image, Tracer) else np.asarray(image[::8, ::8])
-
-
-def _check_depth(depth: Any) -> None:
-    if not jnp.issubdtype(depth.dtype, jnp.floating):
-        raise InputError(f"depth image: holds {depth.dtype}; give floats in metres (millimetres divided by 1000)")
-    values = _values(depth)
-    if values is None:
-        return
-    measured = values[np.isfinite(values) & (values > 0)]
-    if measured.size and np.median(measured) > 20:
-        raise InputError(f"depth image: its median is {np.median(measured):.0f}; give metres, not millimetres")
-
-
-def _check_colour(colour: Any) -> None:
-    if colour.dtype == jnp.uint8:
-        return
-    if not jnp.issubdtype(colour.dtype, jnp.floating):
-        raise InputError(f"colour image: holds {colour.dtype}; give floats from 0 to 1, or uint8")
-    values = _values(colour)
-    if values is not None and not np.all((values >= 0) & (values <= 1)):
-        raise InputError("colour image: its floats must be from 0 to 1; divide 8-bit values by 255")
-
-
-def _check_mask(mask: Any, blind: bool) -> None:
-    if not jnp.issubdtype(mask.dtype, jnp.integer):
-        raise InputError(f"mask image: holds {mask.dtype}; give whole numbers, 0 to 8 for objects, -1 for none")
-    values = _values(mask)
-    if values is None:
-        return
-    low, high = (int(v) for v in (np.asarray(mask).min(), np.asarray(mask).max()))
-    if low < MISSING or high >= INSTANCES:
-        raise InputError(
-            f"mask image: holds numbers from {low} to {high}; objects are 0 to {INSTANCES - 1}, all else -1, -2 or -3"
-        )
-    if blind and high == INSTANCES - 1:
-        raise InputError(f"mask image: nine things are too many; say with target_id which of 0 to {high} is the target")

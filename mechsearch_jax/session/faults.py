@@ -5,23 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.images.checks.usable import check_images
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
-    check_measured,
     colour_faults,
     detection_faults,
     identity_faults,
     image_faults,
-    sight_faults,
 )
-from mechsearch_jax.perception.recogniser import Recogniser, Setting, check_images
+from mechsearch_jax.perception.recogniser import Recogniser, Setting
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.sight import camera_faults
@@ -36,42 +35,47 @@ def view_warnings(workcell: Workcell, recogniser: Any) -> tuple[str, ...]:
     return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
 
 
-def placement_warnings(setting: Setting, calibration: CalibrationLimits, depth: np.ndarray) -> tuple[str, ...]:
-    """Warnings about where the shelf is in a depth image; they need no recogniser.
+def check_image(
+    setting: Setting, calibration: CalibrationLimits, images: Images, recogniser: Any = None
+) -> tuple[Look, list[str]]:
+    """Check the images of one look before anything is recognised in them.
 
     Args:
-      setting: gives camera and shelf, such as a problem.
+      setting: gives camera, shelf and target, such as a problem.
       calibration: how far the shelf may be from its place.
-      depth: as of `Searcher.next`.
+      images: as `images.converted` gives them.
+      recogniser: that will be called with them; if it is no `Recogniser`, or None, how it identifies the target is not
+        checked.
+
+    Returns:
+      The look, for `recognition_warnings`, and warnings about images that do not fit camera, shelf and target.
 
     Raises:
-      InputError: the image cannot be used.
+      InputError: an image cannot be used, or the shelf is too far from where it should be.
     """
-    check_images(setting.camera, depth)
-    check_measured(setting.camera, setting.shelf, depth)
-    return placement_faults(setting.camera, setting.shelf, depth, calibration)
+    check_images(setting.camera, *images)
+    detector = recogniser.detector if isinstance(recogniser, Recogniser) and images.target_id is None else None
+    look = Look(setting.camera, setting.shelf, images.depth, images.colour, images.mask, detector)
+    faults = image_warnings(setting, recogniser, look, images.target_id)
+    return look, [*placement_faults(setting.camera, setting.shelf, images.depth, calibration), *faults]
 
 
-def image_warnings(setting: Setting, recogniser: Any, images: Images, observation: Observation) -> list[str]:
-    """Warnings about images that do not fit camera, shelf and target; the observation is of them."""
-    camera, shelf, depth, target_id = setting.camera, setting.shelf, images.depth, images.target_id
-    mask, colour = (None if image is None else np.asarray(image) for image in (images.mask, images.colour))
-    faults = list(image_faults(camera, shelf, depth, mask))
+def image_warnings(setting: Setting, recogniser: Any, look: Look, target_id: int | None) -> list[str]:
+    """Warnings about images that do not fit camera, shelf and target, beside the place of the shelf."""
+    faults = list(image_faults(look))
     # Another recogniser may identify the target in another way.
     if isinstance(recogniser, Recogniser):
-        faults += identity_faults(colour, mask, target_id)
-        if colour is not None and target_id is None:
-            detector = recogniser.detector
-            faults += colour_faults(camera, shelf, setting.target, detector, depth, colour)
-            if mask is None:
-                faults += detection_faults(camera, shelf, detector, depth, colour, observation)
+        faults += identity_faults(look, target_id)
+    if look.detector is not None and look.colour is not None:
+        faults += colour_faults(look, setting.target)
     return faults
 
 
-def recognition_warnings(setting: Setting, depth: np.ndarray, observation: Observation) -> list[str]:
-    """Warnings about what is recognised: nothing, too much, or objects in each other."""
-    unseen = sight_faults(setting.camera, setting.shelf, depth, observation)
-    return [*unseen, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
+def recognition_warnings(setting: Setting, look: Look, observation: Observation) -> list[str]:
+    """Warnings about what is recognised: not the target, too much, or objects in each other."""
+    coloured = look.detector is not None and look.colour is not None and look.mask is None
+    other = detection_faults(look, observation) if coloured else ()
+    return [*other, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
 
 
 def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:

@@ -31,7 +31,7 @@ from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.plausibility import EMPTY_SHELF
+from mechsearch_jax.perception.plausibility import EMPTY_SHELF, sight_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.learning import LearnedFriction, restored
 from mechsearch_jax.planner.noted_trials import NotedTrials, nothing_tried
@@ -280,13 +280,13 @@ class Searcher:
         # With the same key, a refused action would be drawn again.
         recognition_key, decision_key = jax.random.split(jax.random.fold_in(step_key, now.refusals))
         images, present = converted(depth, colour, mask, target_id), self._present(joints, width)
-        observation, warnings, shelf_is_empty = self._seen(recognition_key, images)
+        observation, warnings, unseen = self._seen(recognition_key, images)
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        warnings += faults.belief_warnings(now.belief, belief, shelf_is_empty=shelf_is_empty)
+        warnings += faults.belief_warnings(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
         learned = self._learned(observation)
         trials = self._trials if learned is None else learned.trials([0])
-        decision, motion, noted = self._decide(decision_key, trials, belief, observation, images.depth, present)
+        decision, motion, noted = self._decide(decision_key, trials, belief, observation, images.depth, unseen, present)
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -307,19 +307,18 @@ class Searcher:
             self._shown = step
         return step
 
-    def _seen(self, key: Array, images: Images) -> tuple[Observation, list[str], bool]:
-        """What is recognised in images, warnings about them, and whether they show an empty shelf.
+    def _seen(self, key: Array, images: Images) -> tuple[Observation, list[str], tuple[str, ...]]:
+        """What is recognised in images, warnings about them, and those that say why nothing is recognised.
 
         Raises:
           InputError: as `next`.
         """
         problem = self.problem
-        misplaced = faults.placement_warnings(problem, self.workcell.calibration, images.depth)
-        observation = self.recogniser(key, *images).judged()
-        of_images = faults.image_warnings(problem, self.recogniser, images, observation)
-        of_objects = faults.recognition_warnings(problem, images.depth, observation)
-        warnings = [*self._view_warnings, *misplaced, *of_images, *of_objects]
-        return observation, warnings, EMPTY_SHELF in of_objects
+        look, of_images = faults.check_image(problem, self.workcell.calibration, images, self.recogniser)
+        recognise = self.recogniser.unchecked if isinstance(self.recogniser, Recogniser) else self.recogniser
+        observation = recognise(key, *images).judged()
+        unseen, of_objects = sight_faults(look, observation), faults.recognition_warnings(problem, look, observation)
+        return observation, [*self._view_warnings, *of_images, *unseen, *of_objects], unseen
 
     def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
         """Keep of a step what the next one needs."""
@@ -365,6 +364,7 @@ class Searcher:
         belief: Belief,
         observation: Observation,
         depth: np.ndarray,
+        unseen: tuple[str, ...],
         present: Present,
     ) -> tuple[Decision, Motion, NotedTrials | None]:
         """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it, and its trials if shown.
@@ -377,7 +377,7 @@ class Searcher:
             noted = NotedTrials(trials) if trials is not None and self._view is not None else None
             last = self._now.index >= self.config.max_steps
             decision = decide(self._policy, noted or trials, draw_key, problem, belief, observation, last)
-            motion = motion_of(problem, belief, observation, decision, depth, present, arm, self._motions)
+            motion = motion_of(problem, belief, observation, decision, depth, unseen, present, arm, self._motions)
             if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
         return decision, self._within_limit(motion), noted

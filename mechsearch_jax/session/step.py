@@ -18,7 +18,6 @@ from mechsearch_jax.belief.belief import Belief, graspability_map, sweeps_unmeas
 from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
-from mechsearch_jax.perception.plausibility import sight_faults
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
@@ -27,6 +26,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.step_json import step_json
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
+from mechsearch_jax.workspace.camera import measured
 
 # Why no motion is made that would sweep space in which something may stand that has no depth.
 UNMEASURED = (
@@ -131,6 +131,7 @@ def motion_of(
     observation: Observation,
     decision: Decision,
     depth: Float[np.ndarray, "h w"],
+    unseen: tuple[str, ...],
     present: Present,
     arm: ArmConfig,
     config: TrajectoryConfig,
@@ -140,6 +141,7 @@ def motion_of(
     Args:
       problem, belief, observation, decision: the decision and what it is based on.
       depth: the image that `observation` comes from.
+      unseen: why nothing is recognised in it; empty if anything is.
       present: arm and hand.
       arm: home and speed.
       config: how trajectories are made.
@@ -147,8 +149,8 @@ def motion_of(
     kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
     target = "the target is found" if belief.found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
     if kind.code == ActionKind.NONE:
-        if faults := sight_faults(problem.camera, problem.shelf, depth, observation):
-            return Motion(nothing, "; ".join(faults), None)
+        if unseen:
+            return Motion(nothing, "; ".join(unseen), None)
         refused = int(decision.refused)
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
@@ -183,9 +185,9 @@ def display_image(depth: np.ndarray, colour: Any) -> np.ndarray:
     if colour is not None:
         image = np.asarray(colour)
         return image if image.dtype == np.uint8 else np.round(255 * image).astype(np.uint8)
-    measured = np.isfinite(depth) & (depth > 0)
-    low, high = np.percentile(depth[measured], (1, 99)) if measured.any() else (0.0, 1.0)
+    known = np.isfinite(depth) & measured(depth)
+    low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     with np.errstate(invalid="ignore"):
         shade = np.clip((high - depth) / max(high - low, 1e-6), 0.0, 1.0) * 200 + 30
-    grey = np.where(measured, shade, 0.0).astype(np.uint8)
+    grey = np.where(known, shade, 0.0).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)

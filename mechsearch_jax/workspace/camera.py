@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,8 @@ from mechsearch_jax.workspace.leaves import are_given
 # Largest number of pixels along a side, and largest coordinate of the position [m].
 LARGEST = 16384
 FARTHEST = 10.0
+# No depth camera of a robot measures so far [m]: in whole millimetres, 65535 stands for no measurement.
+BEYOND = 65.0
 # The fields that are dynamic under `jit`.
 _DATA = ("fx", "fy", "cx", "cy", "rotation", "position")
 
@@ -96,6 +100,15 @@ class Camera:
             cx=self.cx / factor,
             cy=self.cy / factor,
         )
+
+
+def measured(depth: Any) -> Any:
+    """Which pixels of a depth image [m], an array of NumPy or JAX, hold a measurement.
+
+    As in ROS (REP 118), infinity says that nothing is within the sensor's range, and counts; NaN, minus infinity, 0,
+    negative numbers, and finite ones of `BEYOND` and more do not.
+    """
+    return (depth > 0) & ((depth < BEYOND) | (depth == math.inf))
 
 
 def pixel_rays(

@@ -60,7 +60,7 @@ def blindness(camera: Camera, shelf: Shelf) -> str | None:
 
 
 def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
-    """Warnings about a camera's pose relative to the shelf.
+    """Warnings about a camera's pose relative to the shelf. Only an image tells whether it hangs upside down.
 
     Args:
       camera: with x right, y down and z forward.
@@ -69,11 +69,6 @@ def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
     fault = blindness(camera, shelf)
     if fault is not None:
         return (fault,)
-    if np.array(camera.rotation)[2, 1] > UPSIDE_DOWN:
-        return (
-            "camera: is upside down: the rows of its image run upwards in the world; negate the first two columns of "
-            "the rotation, or turn the image",
-        )
     sight = _sight(camera, _pose(camera), shelf)
     return (_mistake(camera, shelf) or _little(sight),) if sight.seen < LEAST_SEEN else ()
 

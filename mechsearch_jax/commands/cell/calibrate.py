@@ -39,8 +39,10 @@ def calibrate(
       moved: what is off and is corrected: the camera's pose, or the place of the shelf.
       out: file for the correction: the configuration with the corrected pose (.toml), or the camera (.json).
     """
-    from mechsearch_jax.calibration.fit import check_in_sight, fit_shelf
+    from mechsearch_jax.calibration.check import check_holds, check_in_sight
+    from mechsearch_jax.calibration.fit import fit_shelf
     from mechsearch_jax.calibration.report import report
+    from mechsearch_jax.images.checks.usable import check_images
     from mechsearch_jax.images.image_files import load_camera, load_depth
     from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.workspace.sight import check_camera
@@ -54,9 +56,11 @@ def calibrate(
     if out is not None:
         check_writable(out.parent)
     check_camera(given, shelf)
+    check_images(given, image)
     fit = fit_shelf(given, shelf, image)
-    check_in_sight(fit)
+    check_in_sight(fit, shelf, image)
     print(report(fit, moved))
+    check_holds(fit, shelf, image)
     if moved == "shelf":
         if (turn := float(sum(fit.turn**2)) ** 0.5) > SHELF_TURN:
             raise InputError(

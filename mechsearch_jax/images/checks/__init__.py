@@ -1,0 +1,1 @@
+"""Checks of the images of a camera."""
