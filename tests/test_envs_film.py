@@ -24,7 +24,7 @@ from mechsearch_jax.envs.recording.recording import (
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.bodies import with_parts
-from mechsearch_jax.robot.arm import PANDA
+from mechsearch_jax.robot.arm_config import PANDA
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.movie import save_movie

@@ -21,7 +21,7 @@ from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot import motion
-from mechsearch_jax.robot.arm import ARMS, PANDA
+from mechsearch_jax.robot.arm_config import ARMS, PANDA
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import (

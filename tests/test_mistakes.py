@@ -24,7 +24,7 @@ from mechsearch_jax.perception.plausibility import check_measured, colour_faults
 from mechsearch_jax.perception.recogniser import check_images
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.arm_config import check_joints
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.workspace.sight import camera_faults, check_camera

@@ -13,9 +13,9 @@ from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.robot.arm import PANDA
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Held, Obstacles, clearance, tip_positions
-from mechsearch_jax.robot.free_motion import FreeMotionConfig, check_joints, free_motion, free_path
+from mechsearch_jax.robot.arm_config import PANDA, check_joints
+from mechsearch_jax.robot.free_motion import FreeMotionConfig, free_motion, free_path
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.kinematics import HOME, gripper_pose, inverse_kinematics
 from mechsearch_jax.robot.robot_trajectory import limit_shares

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.arm import PANDA
+from mechsearch_jax.robot.arm_config import PANDA
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
 

@@ -15,7 +15,7 @@ from mechsearch_jax.actions import ActionConfig
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot import motion
-from mechsearch_jax.robot.arm import PANDA
+from mechsearch_jax.robot.arm_config import PANDA
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.kinematics import HOME, line_poses, path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig

@@ -33,7 +33,7 @@ from mechsearch_jax.envs.world.body_model import (
     text,
 )
 from mechsearch_jax.envs.world.world import BODIES
-from mechsearch_jax.robot.arm import ARMS
+from mechsearch_jax.robot.arm_config import ARMS
 from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINTS
 from mechsearch_jax.shapes import by_shape, in_order, shape_of

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.transforms import back_off, translate
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.gripper import Gripper, joints_hit_shelf
 from mechsearch_jax.robot.kinematics import path_joints, path_kinematics, still_ahead
 from mechsearch_jax.runtime.errors import InputError

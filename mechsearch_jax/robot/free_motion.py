@@ -17,8 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mechsearch_jax.robot.arm import ARMS, PANDA, Arm
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Obstacles, clearance
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.robot.time_scaling import smooth_curve, timing, travelled
 from mechsearch_jax.runtime.errors import InputError
@@ -122,30 +122,6 @@ class _Space:
         line = _line(start, end, self.step)
         order = np.concatenate([np.arange(i, len(line), STRIDES) for i in range(STRIDES)])
         return all(self.allowed(line[order[i : i + LOOK]]).all() for i in range(0, len(line), LOOK))
-
-
-def check_joints(name: str, q: Float[np.ndarray, "..."], arm: Arm = PANDA) -> None:
-    """Check that joint angles are seven numbers within the limits of an arm.
-
-    Raises:
-      InputError: they are not.
-    """
-    if np.shape(q) != (7,) or not np.isfinite(q).all():
-        raise InputError(f"{name}: {np.asarray(q).tolist()} must be seven joint angles in radians")
-    outside = _outside(q, arm)
-    if len(outside):
-        i = int(outside[0])
-        others = [other.name for other in ARMS.values() if not len(_outside(q, other))]
-        mend = f"if this is an {others[0]}, say so by model in [arm]" if others else "give radians"
-        raise InputError(
-            f"{name}: joint {i + 1} at {q[i]:.4f} rad is beyond its limits on a {arm.name}, "
-            f"{arm.least[i]:.4f} to {arm.most[i]:.4f}; {mend}"
-        )
-
-
-def _outside(q: np.ndarray, arm: Arm) -> np.ndarray:
-    """Indices of the joints that are beyond the limits of an arm."""
-    return np.flatnonzero((q < arm.lower - 1e-4) | (q > arm.upper + 1e-4))
 
 
 def free_motion(
@@ -346,7 +322,7 @@ def timed_rows(
     curve = _smooth_curve(points.astype(np.float32), arm=arm)
     seconds, ramp = _timing(curve, np.float32(least), np.float32(pace * (1.0 - SPARE)), arm=arm)
     if seconds > max(least, LONGEST / pace):
-        raise InputError(f"free motion: near its end a joint of an {arm.name} may hardly move; keep farther from it")
+        raise InputError(f"free motion: near its end a joint of the {arm.name} may hardly move; keep farther from it")
     steps = max(1, math.ceil(float(seconds) / timestep - 1e-6))
     rows = travelled(curve, int(ramp), steps)
     # Near the corners of a planned path there may be peaks between the samples of `timing`.

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.swept_cloud import Solid, cloud_of
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.kinematics import Numbers
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf

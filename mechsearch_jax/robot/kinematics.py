@@ -24,12 +24,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import back_off
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import HOME, PANDA, Arm
 from mechsearch_jax.runtime.errors import InputError
 
 Numbers = Array | np.ndarray
 
-HOME = np.array([0.0301, -1.4702, 0.0279, -2.4376, 0.1466, 2.3087, 0.7012], np.float32)
 
 # One row for each joint: distance a [m] and angle alpha [quarter turns] along the previous x, distance d [m] along z.
 JOINTS = (

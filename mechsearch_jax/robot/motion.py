@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.geometry.transforms import translate
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.entry import way_in, ways_in
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import path_kinematics

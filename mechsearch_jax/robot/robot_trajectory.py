@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.hand import HandEvent
 from mechsearch_jax.runtime.errors import InputError
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.interpolate import CubicSpline
 
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 
 # Candidate shares of a stretch's time in which its speed rises, and falls. Short ramps suit long stretches, which
 # velocities limit; the first of equally fast ones is chosen, which is closest to 3 u^2 - 2 u^3.

@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.robot.arm import PANDA, Arm
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.free_motion import WAYPOINTS
 from mechsearch_jax.robot.kinematics import gripper_pose, line_poses, path_kinematics
 from mechsearch_jax.runtime.errors import InputError

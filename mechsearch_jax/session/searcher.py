@@ -40,7 +40,7 @@ from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.arm_config import check_joints
 from mechsearch_jax.robot.hand import checked_width
 from mechsearch_jax.robot.motion import motion_with
 from mechsearch_jax.runtime.errors import InputError

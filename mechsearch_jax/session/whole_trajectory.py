@@ -20,8 +20,8 @@ from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearance, tip_positions
-from mechsearch_jax.robot.arm_config import check_place
-from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, check_joints, free_motion, timed_rows
+from mechsearch_jax.robot.arm_config import check_joints, check_place
+from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, free_motion, timed_rows
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig, HandMove, checked_width, longest_way, stroke
 from mechsearch_jax.robot.kinematics import HOME
