@@ -80,7 +80,11 @@ def test_the_panda_is_what_it_was():
     trajectory = taken()
     assert trajectory.arm == PANDA == Gripper().arm == Workcell().gripper.arm
     assert len(trajectory.time) == 1627
-    expected = EXPECTED
+    expected = [
+        [-0.007022, -1.495183, 0.075122, -2.512587, 0.220005, 2.319705, 0.669245],
+        [-0.038763, -0.756806, 0.303209, -2.725941, 0.484843, 3.116888, 0.523599],
+        [-0.032313, -0.679469, 0.298531, -2.701162, 0.473575, 3.170695, 0.523599],
+    ]
     np.testing.assert_allclose(trajectory.position[[100, 600, 1100]], expected, atol=1e-5)
 
 
@@ -92,7 +96,7 @@ def test_speeds_fall_near_the_ends_of_an_fr3s_joints_and_nowhere_on_a_panda():
         np.testing.assert_allclose(speeds, np.maximum(limit, 1e-3), atol=1e-5)
         in_jax = FR3.speeds(jnp.float32(q), jnp.full(q.shape, way))
         np.testing.assert_allclose(in_jax, speeds, atol=2e-3)
-    np.testing.assert_array_equal(PANDA.speeds(q, q), np.float32(PANDA.velocity))
+    np.testing.assert_array_equal(PANDA.speeds(q, q), np.float32(PANDA.velocity)[None])
 
 
 @pytest.mark.parametrize("corners", [2, 3])
@@ -188,7 +192,7 @@ def test_a_workcell_has_one_arm():
     assert Workcell().with_arm("fr3").with_arm("panda") == Workcell()
     with pytest.raises(InputError, match="ArmConfig: place: joint 6"):
         cell.with_arm("panda")
-    with pytest.raises(InputError, match="the gripper is on the fr3, but arm.model says panda"):
+    with pytest.raises(InputError, match=r"the gripper is on the fr3, but arm\.model says panda"):
         Workcell(gripper=Gripper(arm=FR3))
     with pytest.raises(InputError, match="model 'fr4' is unknown; did you mean fr3"):
         ArmConfig(model="fr4")

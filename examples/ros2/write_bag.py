@@ -3,7 +3,7 @@
     pip install rosbags
     python write_bag.py mine.bag
 
-Copy it and change it: `bag_message` makes a message of every dictionary of `mechsearch_jax.robot.ros_messages` whose type
+Copy it and change it: `bag_message` makes a message of any dictionary of `mechsearch_jax.robot.ros_messages` whose type
 the store knows.
 """
 
@@ -32,7 +32,7 @@ def bag_message(store, kind, values):
             return [bag_message(store, of[0][1], each) for each in value]
         return value
 
-    constants, fields = store.fielddefs[kind]
+    _, fields = store.fielddefs[kind]
     return store.types[kind](**{name: made(description, values[name]) for name, description in fields})
 
 

@@ -72,13 +72,14 @@ class Arm:
           way: of the same shape; its signs are the directions in which the joints move.
 
         Returns:
-          Shape (..., 7), or (7,) where they do not depend on the angles.
+          Shape (..., 7), or (1, ..., 7) where they do not depend on the angles.
         """
-        fastest = np.array(self.velocity, np.float32)
+        row = (*[1] * (q.ndim - 1), 7)
+        fastest = np.array(self.velocity, np.float32).reshape(row)
         if not self.slowing:
             return fastest
         xp: Any = np if isinstance(q, np.ndarray) else jnp
-        offset, rate, low, high = np.array(self.slowing, np.float32).T
+        offset, rate, low, high = (np.reshape(each, row) for each in np.array(self.slowing, np.float32).T)
         room = xp.maximum(xp.where(way > 0, high - q, q - low), 1e-9)
         return xp.clip(xp.sqrt(rate * room) - offset, SLOWEST, fastest)
 

@@ -90,9 +90,9 @@ def timing(
     ratios = [
         jnp.maximum(jnp.max(jnp.abs(peak) / limit, axis=(1, 2)), 1e-12)
         for peak, limit in (
-            (velocity, speeds),
-            (acceleration, np.array(arm.acceleration, np.float32)),
-            (jerk, np.array(arm.jerk, np.float32)),
+            (velocity, speeds[None]),
+            (acceleration, np.array(arm.acceleration, np.float32)[None, None]),
+            (jerk, np.array(arm.jerk, np.float32)[None, None]),
         )
     ]
     needed = jnp.maximum(ratios[0], jnp.maximum(ratios[1] ** (1 / 2), ratios[2] ** (1 / 3)))
