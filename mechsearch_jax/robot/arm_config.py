@@ -117,20 +117,20 @@ class ArmConfig:
     """Which arm it is and how it is used; hashable. Decisions depend on the model alone, by its joints' limits.
 
     Attributes:
+      model: the arm whose limits hold and whose joints are named, one of `ARMS`.
       home: joint angles where it waits between motions, out of the camera's sight [rad].
       speed: share of the joints' limits that velocities may reach, above 0 and at most 1; accelerations reach its
         square, and jerks its cube.
       place: where a target that was taken out is put down: x, y and z of where its foot is to stand, in the frame
         of the robot's base [m], or seven joint angles at which the hand opens [rad]; it stays in the hand if empty.
-      model: the arm whose limits hold and whose joints are named, one of `ARMS`.
     """
 
+    # First, since the others are checked by it where settings are restored one by one; the gripper's text has it.
+    model: ArmModel = dataclasses.field(default="panda", repr=False)
     home: tuple[float, ...] = tuple(round(float(q), 4) for q in HOME)
     speed: float = 1.0
     # Searches are saved with a digest of this text, and may go on after the place has changed.
     place: tuple[float, ...] = dataclasses.field(default=(), repr=False)
-    # The gripper's text has it, if it is not a Panda.
-    model: ArmModel = dataclasses.field(default="panda", repr=False)
 
     def __post_init__(self):
         if self.model not in ARMS:
