@@ -175,7 +175,7 @@ def found_grasps(
     def enters(shelf, _, row):
         T, q7 = row
         path = way_in(T, gripper.nearest_outside, gripper, CROSSINGS, CLOSE_WAYPOINTS)
-        q, follows = arm_path(path, q7, shelf)
+        q, follows = arm_path(path, q7, shelf, gripper.arm)
         return follows, q[ARM_POSES]
 
     T = compose(T_world_target[None], tables.T_target_gripper)

@@ -24,7 +24,8 @@ from mechsearch_jax.envs.recording.recording import (
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.bodies import with_parts
-from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
+from mechsearch_jax.robot.arm_config import PANDA
+from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.movie import save_movie
 
@@ -157,7 +158,7 @@ def test_the_arm_goes_where_it_was_set_and_nothing_faster_than_it_can(played):
     assert (np.diff(played.step) >= 0).all()
     turned = np.abs(np.diff(played.q, axis=0)) * 25
     together = np.diff(played.step) == 0
-    assert (turned[together] < 1.01 * VELOCITY_LIMIT).all()
+    assert (turned[together] < 1.01 * np.array(PANDA.velocity)).all()
     for i in (0, 1):
         np.testing.assert_allclose(played.q[played.step == i][[0, -1]], [HOME, HOME], atol=1e-4)
     # A retrieval ends where the hand holds the target.

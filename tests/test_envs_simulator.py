@@ -21,12 +21,11 @@ from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.arm_config import ARMS, PANDA
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import (
     HOME,
-    JOINT_LOWER,
-    JOINT_UPPER,
     forward_kinematics,
     gripper_pose,
     line_kinematics,
@@ -112,7 +111,7 @@ def test_the_model_has_the_robot_of_the_kinematics():
     data = mujoco.MjData(compiled)
     rng = np.random.default_rng(0)
     for _ in range(5):
-        q = rng.uniform(JOINT_LOWER, JOINT_UPPER)
+        q = rng.uniform(PANDA.lower, PANDA.upper)
         data.qpos[:7] = q
         mujoco.mj_kinematics(compiled, data)
         frames = np.asarray(forward_kinematics(jnp.asarray(q, jnp.float32)))
@@ -121,7 +120,9 @@ def test_the_model_has_the_robot_of_the_kinematics():
             np.testing.assert_allclose(data.body(f"link{i + 1}").xmat.reshape(3, 3), frames[i, :3, :3], atol=2e-6)
         np.testing.assert_allclose(data.site("gripper").xpos, gripper_pose(q)[:3, 3], atol=2e-6)
         np.testing.assert_allclose(data.site("gripper").xmat.reshape(3, 3), gripper_pose(q)[:3, :3], atol=2e-6)
-    np.testing.assert_allclose(compiled.jnt_range[:7], np.stack([JOINT_LOWER, JOINT_UPPER], axis=1), atol=1e-6)
+    for arm in ARMS.values():
+        assert (compiled.jnt_range[:7, 0] <= arm.least).all()
+        assert (compiled.jnt_range[:7, 1] >= arm.most).all()
 
 
 @pytest.mark.parametrize("body", [standing("box", (0.03, 0.02, 0.05), 0.6, 0.1), TARGET_BODY])

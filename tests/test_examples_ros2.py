@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import runpy
 import sys
 import time
 import types
@@ -204,7 +205,7 @@ def start(monkeypatch):
     """A node of the example, and its stand-in."""
 
     def started(**parameters):
-        stand_in = StandIn(robot="fr3", **parameters)
+        stand_in = StandIn(**{"robot": "fr3", **parameters})
         for name, module in stand_in.modules():
             monkeypatch.setitem(sys.modules, name, module)
         spec = importlib.util.spec_from_file_location("search_node", NODE)
@@ -304,6 +305,38 @@ def test_joint_states_without_positions_and_stale_ones_are_not_taken(start, monk
     with pytest.raises(TimeoutError, match="joint states of the arm"):
         _ = node.joints
     assert node.width is None
+
+
+def test_the_arm_is_the_nodes_or_the_configurations(start, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text("[arm]\nmodel = 'fr3'\n")
+    for given, joint, model in (
+        ({"robot": ""}, "panda_joint1", "panda"),
+        ({"robot": "", "config": str(file)}, "fr3_joint1", "fr3"),
+        ({"robot": "panda", "config": str(file)}, "panda_joint1", "panda"),
+        ({"robot": "left_fr3"}, "left_fr3_joint1", "fr3"),
+    ):
+        _, node, _ = start(**given)
+        assert (node.joint_names[0], node.model) == (joint, model)
+    with pytest.raises(ValueError, match="robot: ur5 is none of panda, fr3"):
+        start(robot="ur5")
+
+
+def test_a_motion_is_written_as_a_bag(tmp_path):
+    pytest.importorskip("rosbags")
+    from rosbags.highlevel import AnyReader
+
+    example = runpy.run_path(str(NODE.with_name("write_bag.py")))
+    trajectory = taken()
+    example["write_bag"](tmp_path / "bag", trajectory)
+    with AnyReader([tmp_path / "bag"]) as reader:
+        ((connection, _, data),) = reader.messages()
+        read = reader.deserialize(data, connection.msgtype)
+    assert connection.msgtype == "trajectory_msgs/msg/JointTrajectory"
+    assert read.joint_names == [f"panda_joint{i}" for i in range(1, 8)]
+    np.testing.assert_array_equal([point.positions for point in read.points], trajectory.position)
+    np.testing.assert_array_equal([point.velocities for point in read.points], trajectory.velocity)
+    assert read.points[1].time_from_start.nanosec == 4_000_000
 
 
 def test_arm_and_hand_take_turns(start):
@@ -414,13 +447,15 @@ def test_the_node_cancels_before_it_shuts_down(start, monkeypatch):
 
     info = INFO(k=[400.0, 0.0, 400.5, 0.0, 401.0, 220.5, 0.0, 0.0, 1.0], width=640, height=480)
     monkeypatch.setattr(example, "SearchNode", lambda: node)
-    monkeypatch.setattr(example, "load_searcher", unittest.mock.MagicMock())
+    load = unittest.mock.MagicMock()
+    monkeypatch.setattr(example, "load_searcher", load)
     monkeypatch.setattr(example, "search", search)
     monkeypatch.setattr(example.signal, "signal", lambda number, handler: None)
     stand_in.publish("/camera/camera/color/camera_info", info)
     with pytest.raises(KeyboardInterrupt):
         example.main()
     assert interrupted == [True]
+    assert load.call_args.kwargs["arm"] == "fr3"
     assert stand_in.cancelled == ["grasp", "shutdown"]
 
 

@@ -23,7 +23,7 @@ from mechsearch_jax.images.image_files import (
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.arm_config import check_joints
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.faults import check_image
 from mechsearch_jax.session.images import converted

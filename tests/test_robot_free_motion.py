@@ -14,9 +14,10 @@ from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Held, Obstacles, clearance, tip_positions
-from mechsearch_jax.robot.free_motion import FreeMotionConfig, check_joints, free_motion, free_path
+from mechsearch_jax.robot.arm_config import PANDA, check_joints
+from mechsearch_jax.robot.free_motion import FreeMotionConfig, free_motion, free_path
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
-from mechsearch_jax.robot.kinematics import HOME, JOINT_LOWER, JOINT_UPPER, gripper_pose, inverse_kinematics
+from mechsearch_jax.robot.kinematics import HOME, gripper_pose, inverse_kinematics
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -68,7 +69,7 @@ def test_the_clearance_is_never_more_than_that_of_the_simulators_geometry():
     links = [g for g in range(model.ngeom) if model.geom_bodyid[g] and model.geom_contype[g] == models.ROBOT_BIT]
     others = [model.geom(f"{name}_box").id for name in models.shelf_boxes(bare)] + [model.geom("box0").id]
     obstacles = Obstacles.of(bare, (boxes(box.position, half=box.half_size),))
-    q = np.clip(HERE + rng.normal(0.0, 0.35, (60, 7)), JOINT_LOWER, JOINT_UPPER)
+    q = np.clip(HERE + rng.normal(0.0, 0.35, (60, 7)), PANDA.lower, PANDA.upper)
     distances = clearance(ArmBody.of(0.05), obstacles, q)
     short = []
     for angles, free in zip(q, distances.free, strict=True):
@@ -204,9 +205,8 @@ def test_impossible_settings_are_refused(changes):
 def test_a_way_takes_hardly_more_than_the_time_optimal_one():
     """Of velocities and accelerations, without a limit of the jerk."""
     toppra = pytest.importorskip("toppra")
-    from mechsearch_jax.robot.kinematics import ACCELERATION_LIMIT, VELOCITY_LIMIT
 
-    bounds = [np.stack([-limit, limit], axis=1).astype(float) for limit in (VELOCITY_LIMIT, ACCELERATION_LIMIT)]
+    bounds = [np.outer(limit, (-1.0, 1.0)) for limit in (PANDA.velocity, PANDA.acceleration)]
     limits = [
         toppra.constraint.JointVelocityConstraint(bounds[0]),
         toppra.constraint.JointAccelerationConstraint(bounds[1]),
@@ -222,7 +222,7 @@ def test_random_ends_are_joined_without_touching_anything():
     rng = np.random.default_rng(1)
     scene = boxes((0.5, 0.1, 0.45), (0.42, -0.1, 0.46))
     obstacles = Obstacles.of(SHELF, (scene,))
-    q = np.clip(HERE + rng.normal(0.0, 0.5, (60, 7)), JOINT_LOWER + 0.01, JOINT_UPPER - 0.01)
+    q = np.clip(HERE + rng.normal(0.0, 0.5, (60, 7)), PANDA.lower + 0.01, PANDA.upper - 0.01)
     distances = clearance(BODY, obstacles, q)
     free = q[(distances.free > 0.01) & (distances.inside < -0.01)][:8]
     assert len(free) == 8
@@ -231,8 +231,8 @@ def test_random_ends_are_joined_without_touching_anything():
         assert clearance(BODY, obstacles, way.position).free.min() > 0.003
         rows = np.concatenate([HERE[None], way.position])
         assert max(limit_shares(rows, DT)) <= 1.0
-        assert (rows >= JOINT_LOWER - 1e-3).all()
-        assert (rows <= JOINT_UPPER + 1e-3).all()
+        assert (rows >= PANDA.lower - 1e-3).all()
+        assert (rows <= PANDA.upper + 1e-3).all()
 
 
 def test_poses_come_in_blocks_as_at_once():

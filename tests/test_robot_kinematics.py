@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.kinematics import HOME, JOINT_LOWER, JOINT_UPPER
+from mechsearch_jax.robot.arm_config import PANDA
+from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
 
 inverse = jax.jit(kinematics.inverse_kinematics)
@@ -19,8 +20,8 @@ BENT = -0.48  # joint 4 beyond this is the almost straight arm
 def configurations(seed: int, count: int) -> np.ndarray:
     """Random joint angles inside the limits, with a bent elbow."""
     rng = np.random.default_rng(seed)
-    upper = np.where(np.arange(7) == 3, BENT, JOINT_UPPER - 1e-3)
-    return rng.uniform(JOINT_LOWER + 1e-3, upper, (count, 7)).astype(np.float32)
+    upper = np.where(np.arange(7) == 3, BENT, PANDA.upper - 1e-3)
+    return rng.uniform(PANDA.lower + 1e-3, upper, (count, 7)).astype(np.float32)
 
 
 def denavit_hartenberg(q: np.ndarray) -> np.ndarray:
@@ -70,8 +71,8 @@ def test_inverse_kinematics_reach_what_the_arm_reaches(seed):
     moved, turned = errors(np.asarray(forward(solutions))[valid], reached)
     assert moved.max() < 1e-4
     assert turned.max() < 1e-3
-    assert (solutions[valid] >= JOINT_LOWER).all()
-    assert (solutions[valid] <= JOINT_UPPER).all()
+    assert (solutions[valid] >= PANDA.lower).all()
+    assert (solutions[valid] <= PANDA.upper).all()
     np.testing.assert_array_equal(solutions[..., 6], np.broadcast_to(q[:, None, 6], (256, 4)))
     # Near a singularity many configurations share a pose in float32; elsewhere the arm's own is among the solutions.
     nearest = np.abs(np.where(valid[..., None], solutions, np.inf) - q[:, None]).max(axis=-1).min(axis=-1)

@@ -15,15 +15,9 @@ from mechsearch_jax.actions import ActionConfig
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.arm_config import PANDA
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
-from mechsearch_jax.robot.kinematics import (
-    ACCELERATION_LIMIT,
-    HOME,
-    JERK_LIMIT,
-    VELOCITY_LIMIT,
-    line_poses,
-    path_kinematics,
-)
+from mechsearch_jax.robot.kinematics import HOME, line_poses, path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.robot.time_scaling import RAMPS, angles_along, progress, smooth_curve, timing
 from mechsearch_jax.workspace.camera import Camera
@@ -89,7 +83,7 @@ def line(count=31):
 def test_no_joint_exceeds_its_limits_in_the_samples_of_random_motions(kind):
     reference, reachable = references(kind)
     assert reachable.sum() > 25
-    limits = (VELOCITY_LIMIT, ACCELERATION_LIMIT, JERK_LIMIT)
+    limits = (PANDA.velocity, PANDA.acceleration, PANDA.jerk)
     ratios = [
         np.abs(values[reachable]).max(axis=1) / limit for values, limit in zip(sampled(reference), limits, strict=True)
     ]
@@ -106,7 +100,7 @@ def test_what_is_held_is_moved_more_gently():
         np.arange(reference.q.shape[1]) < reference.opens[:, None]
     )
     velocity, acceleration, _ = sampled(reference)
-    for values, limit, power in ((velocity, VELOCITY_LIMIT, 1), (acceleration, ACCELERATION_LIMIT, 2)):
+    for values, limit, power in ((velocity, PANDA.velocity, 1), (acceleration, PANDA.acceleration, 2)):
         values = values[:, -reference.q.shape[1] :][held & reachable[:, None]]
         assert (np.abs(values).max(axis=0) / limit).max() < 1.02 * PLAN.carry_pace**power
 
@@ -232,7 +226,7 @@ def test_a_stretch_takes_no_less_than_the_time_optimal_one():
     """And at most half as long again, although its jerk is bounded and its profile is one of six."""
     toppra = pytest.importorskip("toppra")
     logging.getLogger("toppra").setLevel(logging.ERROR)
-    bounds = [np.stack([-limit, limit], axis=1).astype(float) for limit in (VELOCITY_LIMIT, ACCELERATION_LIMIT)]
+    bounds = [np.outer(limit, (-1.0, 1.0)) for limit in (PANDA.velocity, PANDA.acceleration)]
     limits = [
         toppra.constraint.JointVelocityConstraint(bounds[0]),
         toppra.constraint.JointAccelerationConstraint(bounds[1]),

@@ -19,6 +19,7 @@ from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.problem.cache import keep_compilations
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.robot.arm_config import ArmModel
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.session.view import View
@@ -30,6 +31,7 @@ def load_searcher(
     path: PathLike | None = None,
     *,
     camera: Camera | None = None,
+    arm: ArmModel | None = None,
     policy: str = "search-for-grasp",
     preset: str | None = None,
     seed: int = 0,
@@ -47,6 +49,7 @@ def load_searcher(
     Args:
       path: of the file; all defaults if None.
       camera: replaces the file's, for example one of `images.image_files.load_camera`.
+      arm: replaces the file's model of the arm.
       policy: name or import path, as `--policy` of the command line.
       preset: replaces the file's.
       seed: of all random numbers.
@@ -63,6 +66,7 @@ def load_searcher(
     return searcher_of(
         settings.with_options(preset, **options),
         camera=camera,
+        arm=arm,
         policy=policy,
         seed=seed,
         recogniser=recogniser,
@@ -72,13 +76,18 @@ def load_searcher(
 
 
 def searcher_of(
-    settings: Settings, *, camera: Camera | None = None, policy: str = "search-for-grasp", **arguments: Any
+    settings: Settings,
+    *,
+    camera: Camera | None = None,
+    arm: ArmModel | None = None,
+    policy: str = "search-for-grasp",
+    **arguments: Any,
 ) -> Searcher:
     """A `Searcher` of settings.
 
     Args:
       settings: of a configuration file.
-      camera, policy: as for `load_searcher`.
+      camera, arm, policy: as for `load_searcher`.
       **arguments: of a `Searcher`: seed, recogniser, trajectories, view.
 
     Raises:
@@ -87,5 +96,7 @@ def searcher_of(
     workcell = settings.workcell
     if camera is not None:
         workcell = dataclasses.replace(workcell, camera=camera)
+    if arm is not None:
+        workcell = workcell.with_arm(arm)
     method = Method(policy, settings.config, workcell=workcell)
     return Searcher(workcell, settings.config, policy=method.policy(), rehearsal=method.trials(), **arguments)

@@ -181,7 +181,9 @@ def _settings(config: Config | Workcell | Mismatch, prefix: str) -> Iterator[tup
             else:
                 yield f"{path}{name}", part
 
-    return inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
+    settings = inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
+    # The arm of a workcell's gripper follows from its model.
+    return ((path, value) for path, value in settings if not path.startswith("workcell.gripper.arm."))
 
 
 def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:

@@ -33,8 +33,9 @@ from mechsearch_jax.envs.world.body_model import (
     text,
 )
 from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.robot.arm_config import ARMS
 from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
-from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
+from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINTS
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import Compound, inertial
 from mechsearch_jax.workspace.camera import Camera
@@ -48,6 +49,8 @@ FINGER_FRICTION = 1.0
 ARM_STIFFNESS = (18000.0, 18000.0, 14000.0, 14000.0, 8000.0, 8000.0, 8000.0)
 ARM_VELOCITY_GAIN = (450.0, 450.0, 350.0, 350.0, 200.0, 200.0, 200.0)
 ARM_DAMPING = 1.0
+# One model serves all arms: what keeps an arm's own limits is who moves it.
+LOWER, UPPER = np.min([arm.lower for arm in ARMS.values()], 0), np.max([arm.upper for arm in ARMS.values()], 0)
 ARM_FORCE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 FINGER_STIFFNESS, FINGER_VELOCITY_GAIN, FINGER_FORCE = 1000.0, 40.0, 70.0
 FINGER_TRAVEL = 0.04
@@ -158,7 +161,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
             "joint",
             name=f"joint{i + 1}",
             axis="0 0 1",
-            range=text(JOINT_LOWER[i], JOINT_UPPER[i]),
+            range=text(LOWER[i], UPPER[i]),
             damping=text(ARM_DAMPING),
             armature="0.1",
         )

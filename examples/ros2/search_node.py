@@ -30,6 +30,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from mechsearch_jax.envs.cell.loading import load_searcher
 from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.robot.arm_config import ARMS
 from mechsearch_jax.robot.ros_messages import gripper_command_goal, hand_goal, joint_trajectory_message, legs
 
 # How far the stamps of images that belong together may be apart [s], and how long the node waits for what it needs [s].
@@ -43,7 +44,7 @@ IDLE = 3
 
 PARAMETERS = {
     "config": "",
-    "robot": "panda",
+    "robot": "",
     "depth": "/camera/camera/aligned_depth_to_color/image_raw",
     "colour": "/camera/camera/color/image_raw",
     "camera_info": "/camera/camera/color/camera_info",
@@ -107,8 +108,17 @@ def filled(message, values):
         if isinstance(value, dict):
             filled(getattr(message, name), value)
         else:
-            setattr(message, name, value)
+            # Of sequences rclpy takes lists.
+            setattr(message, name, value.tolist() if isinstance(value, np.ndarray) else value)
     return message
+
+
+def model_of(robot):
+    """The model of the arm whose joints have names with this prefix."""
+    models = [model for model in ARMS if robot.endswith(model)]
+    if not models:
+        raise ValueError(f"robot: {robot} is none of {', '.join(ARMS)}, with or without something in front of it")
+    return models[0]
 
 
 def seconds_of(stamp):
@@ -130,7 +140,10 @@ class SearchNode(Node):
     def __init__(self):
         super().__init__("mechsearch")
         self.given = {name: self.declare_parameter(name, usual).value for name, usual in PARAMETERS.items()}
-        robot = self.given["robot"]
+        path = self.given["config"]
+        self.settings = load_settings(path) if path else Settings()
+        robot = self.given["robot"] or self.settings.workcell.arm.model
+        self.model = model_of(robot)
         self.joint_names = [f"{robot}_joint{i}" for i in range(1, 8)]
         self.finger_names = [f"{robot}_finger_joint{i}" for i in (1, 2)]
         self._latest, self._positions = {}, {}
@@ -365,9 +378,8 @@ def main():
     threading.Thread(target=executor.spin, daemon=True).start()
     try:
         path = node.given["config"] or None
-        settings = Settings() if path is None else load_settings(path)
-        camera = camera_of(node.camera_info(), settings.workcell.camera, node.given["rectified"])
-        searcher = load_searcher(path, camera=camera)
+        camera = camera_of(node.camera_info(), node.settings.workcell.camera, node.given["rectified"])
+        searcher = load_searcher(path, camera=camera, arm=node.model)
         for warning in searcher.check().warnings:
             node.get_logger().warning(warning)
         searcher.warm_up(lambda what, left: node.get_logger().info(f"preparing {what}"), colour=True)

@@ -30,7 +30,7 @@ from mechsearch_jax.robot.hand import (
     longest_way,
 )
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.robot_trajectory import derivatives
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
@@ -174,7 +174,7 @@ def joint_trajectory(
       InputError: the kind of action is unknown, the width is impossible, or the arm does not reach all of the motion,
         or not in time.
     """
-    config, hand = config or MotionConfig(gripper=problem.gripper), hand or HandConfig()
+    config, hand = motion_with(problem.gripper, config), hand or HandConfig()
     widest = problem.gripper.max_opening
     present = widest if width is None else checked_width(width, widest)
     kind = kind_of(int(action.kind))
@@ -192,7 +192,7 @@ def joint_trajectory(
     first = opening_to(start[:7], present, opened, hand, config.timestep, farthest)
     parts: list[Rows] = [first, acting(reference, grip_for(problem, observation, action), config, hand)]
     rows = joined(parts, config.timestep)
-    velocity, _ = derivatives(np.concatenate([start[None, :7], rows.position]), config.timestep)
+    velocity, _ = derivatives(np.concatenate([start[None, :7], rows.position]), config.timestep, rows.rests)
     return JointTrajectory(
         time=(jnp.arange(len(rows.width)) + 1.0) * config.timestep,
         position=jnp.asarray(rows.position, jnp.float32),

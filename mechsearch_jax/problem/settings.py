@@ -101,6 +101,7 @@ def tables() -> dict[str, dict[str, Any]]:
         for name, usual in _PARTS.items()
     }
     parts["target"].pop("compound")
+    parts["gripper"].pop("arm")
     parts["target"] |= _MADE_OF | {COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
@@ -119,6 +120,8 @@ def load_settings(path: PathLike) -> Settings:
     for table in document.tables:
         if table and table not in names:
             raise InputError(f"{document.where(table)} is unknown; {nearest(table, names)}")
+    if "arm" in document.tables.get("gripper", {}):
+        raise InputError(f"{document.where('gripper', 'arm')} is unknown; say which arm it is by model in [arm]")
     for key in document.tables[""]:
         begin = ", ".join(f"[{table}]" for table in names)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")

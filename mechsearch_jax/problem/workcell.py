@@ -10,7 +10,7 @@ from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.images.colour import HUE, RED, TargetColour
 from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.robot.arm_config import ArmConfig
+from mechsearch_jax.robot.arm_config import PANDA, ArmConfig, ArmModel
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig
@@ -26,7 +26,7 @@ class Workcell:
 
     Attributes:
       target: what is searched; for a scenario, which has its own target, how finely it is searched.
-      arm: home and speed, and where it puts the target.
+      arm: which it is, home and speed, and where it puts the target.
       calibration: how far the shelf in an image may be from its place; decisions do not depend on it.
       colour: of the target in colour images: red, green and blue in 0 to 1. The planner's programs do not depend on it.
       hand: how the real hand is used.
@@ -48,6 +48,12 @@ class Workcell:
 
     def __post_init__(self):
         TargetColour.lit(self.colour, self.hue_tolerance)
+        # What plans is given the gripper, and with it the arm.
+        if self.gripper.arm not in (PANDA, self.arm.arm):
+            raise InputError(
+                f"Workcell: the gripper is on the {self.gripper.arm.name}, but arm.model says {self.arm.model}"
+            )
+        object.__setattr__(self, "gripper", dataclasses.replace(self.gripper, arm=self.arm.arm))
         check_outside(self.gripper, self.shelf)
         room = min(self.shelf.back - self.shelf.front, self.shelf.left - self.shelf.right)
         if not 2 * self.target.inset < room:
@@ -62,6 +68,15 @@ class Workcell:
           InputError: the target cannot be grasped by the gripper.
         """
         return cached_problem(target or self.target, config, **self._around)
+
+    def with_arm(self, model: ArmModel) -> Workcell:
+        """The workcell with another model of the arm.
+
+        Raises:
+          InputError: it is unknown, or cannot have the arm's home or place.
+        """
+        gripper = dataclasses.replace(self.gripper, arm=PANDA)
+        return dataclasses.replace(self, arm=dataclasses.replace(self.arm, model=model), gripper=gripper)
 
     @property
     def detector(self) -> TargetColour:

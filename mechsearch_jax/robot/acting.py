@@ -27,25 +27,30 @@ class Rows:
       width: distance between the fingers [m], shape (n,).
       force: grip force [N], shape (n,).
       events: with starts relative to one time step before the first row.
+      rests: numbers of rows after which the arm is at rest, beside all of them.
     """
 
     position: Float[np.ndarray, "n 7"]
     width: Float[np.ndarray, " n"]
     force: Float[np.ndarray, " n"]
     events: tuple[HandEvent, ...] = ()
+    rests: tuple[int, ...] = ()
 
 
 def joined(parts: list[Rows], timestep: float) -> Rows:
     """Rows one after the other."""
-    events, before = [], 0
+    events, rests, before = [], [], 0
     for part in parts:
         events += [dataclasses.replace(e, start=e.start + before * timestep) for e in part.events]
+        rests += [row + before for row in part.rests]
         before += len(part.width)
+        rests.append(before)
     return Rows(
         np.concatenate([part.position for part in parts]),
         np.concatenate([part.width for part in parts]),
         np.concatenate([part.force for part in parts]),
         tuple(events),
+        tuple(rests),
     )
 
 
@@ -87,7 +92,7 @@ def acting(reference: Reference, grip: Grip, motion: MotionConfig, hand: HandCon
     start = np.asarray(reference.start, float)
     position = np.concatenate([start[None, :7], np.asarray(reference.q[:steps], float)])
     opening = 2.0 * max(float(start[7]), 0.0)
-    velocity, acceleration, jerk = limit_shares(position, timestep)
+    velocity, acceleration, jerk = limit_shares(position, timestep, motion.gripper.arm)
     reached = max(velocity, acceleration ** (1 / 2), jerk ** (1 / 3))
     factor = max(1.0, reached / (speed * (1.0 - SPARE)))
 

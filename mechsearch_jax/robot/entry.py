@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.transforms import back_off, translate
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.gripper import Gripper, joints_hit_shelf
 from mechsearch_jax.robot.kinematics import path_joints, path_kinematics, still_ahead
 from mechsearch_jax.runtime.errors import InputError
@@ -127,7 +128,7 @@ def ways_in(
     places = jnp.float32(gripper.outside)
     T = jnp.broadcast_to(T_world_gripper[None], (len(places), 4, 4))
     paths = way_in(T, places, gripper, crossings, waypoints)
-    q, reachable = path_kinematics(paths, q7)
+    q, reachable = path_kinematics(paths, q7, gripper.arm)
     # The first reachable place, or the first one. Selects instead of an index, which would write all paths to memory.
     best, outside = q[0], jnp.float32(gripper.outside[0])
     for i, place in reversed(list(enumerate(gripper.outside))):
@@ -137,26 +138,26 @@ def ways_in(
 
 
 def arm_path(
-    path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf
+    path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf, arm: Arm = PANDA
 ) -> tuple[Float[Array, "w 7"], Bool[Array, ""]]:
     """Joint angles along a path of gripper poses [rad], and whether the arm can follow it.
 
     It can if it stays in one configuration and links 2 to 5 do not touch the shelf.
     """
-    q, follows = _followed(path, q7, shelf)
+    q, follows = _followed(path, q7, shelf, arm)
     return jnp.stack(q, axis=-1), follows
 
 
-def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf) -> Bool[Array, ""]:
+def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf, arm: Arm = PANDA) -> Bool[Array, ""]:
     """Whether the arm can follow a path of gripper poses; see `arm_path`."""
-    return _followed(path, q7, shelf)[1]
+    return _followed(path, q7, shelf, arm)[1]
 
 
 def _followed(
-    path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf
+    path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf, arm: Arm
 ) -> tuple[list[Float[Array, " w"]], Bool[Array, ""]]:
     """`arm_path`, with one array of angles for each joint."""
-    q, reachable = path_joints(path, q7)
+    q, reachable = path_joints(path, q7, arm)
     return q, reachable & ~jnp.any(joints_hit_shelf(q, shelf))
 
 
@@ -198,6 +199,6 @@ def gripper_enters(
     def enters(shared, _, row):
         (shelf, clouds), (T, q7, cloud) = shared, row
         path = way_in(T, gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
-        return arm_follows(path, q7, shelf) & ~cloud_hits_shelf(shelf, T, taken(clouds, cloud[None])[0])
+        return arm_follows(path, q7, shelf, gripper.arm) & ~cloud_hits_shelf(shelf, T, taken(clouds, cloud[None])[0])
 
     return masked_vmap(enters, mask, (shelf, clouds), None, (ways.T_world_gripper, ways.q7, jnp.asarray(ways.cloud)))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Obstacles, clearance
-from mechsearch_jax.robot.kinematics import JOINT_LOWER, JOINT_UPPER
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.robot.time_scaling import smooth_curve, timing, travelled
 from mechsearch_jax.runtime.errors import InputError
@@ -32,7 +32,10 @@ LOOK, STRIDES = 16, 8
 # Share of the limits that is left free for peaks between the samples of `timing`.
 SPARE = 0.01
 
-_smooth_curve, _timing = jax.jit(smooth_curve), jax.jit(timing)
+# Nothing that is not held up by a joint's end takes longer at full pace [s].
+LONGEST = 60.0
+
+_smooth_curve, _timing = (jax.jit(function, static_argnames="arm") for function in (smooth_curve, timing))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,21 +124,6 @@ class _Space:
         return all(self.allowed(line[order[i : i + LOOK]]).all() for i in range(0, len(line), LOOK))
 
 
-def check_joints(name: str, q: Float[np.ndarray, "..."]) -> None:
-    """Check that joint angles are seven numbers within the limits.
-
-    Raises:
-      InputError: they are not.
-    """
-    if np.shape(q) != (7,) or not np.isfinite(q).all():
-        raise InputError(f"{name}: {np.asarray(q).tolist()} must be seven joint angles in radians")
-    outside = np.flatnonzero((q < JOINT_LOWER - 1e-4) | (q > JOINT_UPPER + 1e-4))
-    if len(outside):
-        i = int(outside[0])
-        limits = f"{JOINT_LOWER[i]:.4f} to {JOINT_UPPER[i]:.4f}"
-        raise InputError(f"{name}: joint {i + 1} at {q[i]:.4f} rad is beyond its limits, {limits}; give radians")
-
-
 def free_motion(
     start: Float[np.ndarray, " 7"],
     end: Float[np.ndarray, " 7"],
@@ -146,6 +134,7 @@ def free_motion(
     pace: float = 1.0,
     least: float = 0.0,
     config: FreeMotionConfig | None = None,
+    arm: Arm = PANDA,
 ) -> FreeMotion:
     """A motion between two configurations [rad], through free space and within the joints' limits.
 
@@ -157,22 +146,24 @@ def free_motion(
       pace: share of the limits that velocities may reach; accelerations reach its square, and jerks its cube.
       least: shortest duration, also if nothing moves [s].
       config: how it is planned; the default if None.
+      arm: whose limits hold.
 
     Raises:
-      InputError: an end is not free, or no path was found.
+      InputError: an end is not free, no path was found, or a joint is so near its end that the arm may hardly move.
     """
     config = config or FreeMotionConfig()
-    path = free_path(start, end, body, obstacles, config)
+    path = free_path(start, end, body, obstacles, config, arm)
     straight = len(path) == 2
     if straight and np.max(np.abs(end - start)) < 1e-9:
         waits = np.repeat(start[None], math.ceil(least / timestep - 1e-9), axis=0)
         return FreeMotion(waits, float(clearance(body, obstacles, start[None]).free[0]), True)
     space = _space(path, body, obstacles, config)
-    rows = timed_rows(_respaced(path, WAYPOINTS), timestep, pace, least)
+    rows = timed_rows(_respaced(path, WAYPOINTS), timestep, pace, least, arm)
     if not straight and not space.allowed(_thinned(rows, config.step)).all():
         # The smooth curve cuts a corner and touches something: stop at each corner.
         pieces = [
-            timed_rows(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0) for pair in itertools.pairwise(path)
+            timed_rows(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0, arm)
+            for pair in itertools.pairwise(path)
         ]
         rows = np.concatenate(pieces)
     nearest = clearance(body, obstacles, np.concatenate([start[None], _thinned(rows, config.step)])).free.min()
@@ -185,6 +176,7 @@ def free_path(
     body: ArmBody,
     obstacles: Obstacles,
     config: FreeMotionConfig,
+    arm: Arm = PANDA,
 ) -> Float[np.ndarray, "corners 7"]:
     """Corners, ends included, of a path of straight lines in joint space on which the arm touches nothing [rad].
 
@@ -204,7 +196,7 @@ def free_path(
     if space.passes(*ends):
         return ends
     rng = np.random.default_rng(config.seed)
-    path = _connected(ends, space, config, rng)
+    path = _connected(ends, space, config, rng, arm)
     if path is None:
         raise InputError(f"free motion: no way around the obstacles was found in {config.attempts} attempts")
     return _shortened(path, space, config, rng)
@@ -235,7 +227,7 @@ def _thinned(rows: np.ndarray, step: float) -> np.ndarray:
 
 
 def _connected(
-    ends: np.ndarray, space: _Space, config: FreeMotionConfig, rng: np.random.Generator
+    ends: np.ndarray, space: _Space, config: FreeMotionConfig, rng: np.random.Generator, arm: Arm
 ) -> np.ndarray | None:
     """A path between the ends from two trees that grow towards each other; None if they do not meet."""
     trees = [([end], [-1]) for end in ends]
@@ -243,9 +235,8 @@ def _connected(
     for attempt in range(config.attempts):
         # A path around obstacles is rarely far from both ends; if it is, later attempts draw from everywhere.
         near = attempt < config.attempts // 2
-        lower, upper = (
-            (np.maximum(low, JOINT_LOWER), np.minimum(high, JOINT_UPPER)) if near else (JOINT_LOWER, JOINT_UPPER)
-        )
+        lower, upper = arm.lower, arm.upper
+        lower, upper = (np.maximum(low, lower), np.minimum(high, upper)) if near else (lower, upper)
         place = rng.uniform(lower, upper)
         grown = _grown(trees[attempt % 2], place, space, config.extension)
         if grown is None:
@@ -317,20 +308,25 @@ def _respaced(path: np.ndarray, count: int) -> np.ndarray:
 
 
 def timed_rows(
-    points: Float[np.ndarray, "n 7"], timestep: float, pace: float, least: float = 0.0
+    points: Float[np.ndarray, "n 7"], timestep: float, pace: float, least: float = 0.0, arm: Arm = PANDA
 ) -> Float[np.ndarray, "steps 7"]:
     """Joint angles after each time step of the fastest motion along a smooth curve, from rest to rest.
 
     Args:
       points: of the curve [rad]; it is compiled once for each number of them.
-      timestep, pace, least: as of `free_motion`.
+      timestep, pace, least, arm: as of `free_motion`.
+
+    Raises:
+      InputError: a joint is so near its end that the arm may hardly move.
     """
-    curve = _smooth_curve(points.astype(np.float32))
-    seconds, ramp = _timing(curve, np.float32(least), np.float32(pace * (1.0 - SPARE)))
+    curve = _smooth_curve(points.astype(np.float32), arm=arm)
+    seconds, ramp = _timing(curve, np.float32(least), np.float32(pace * (1.0 - SPARE)), arm=arm)
+    if seconds > max(least, LONGEST / pace):
+        raise InputError(f"free motion: near its end a joint of the {arm.name} may hardly move; keep farther from it")
     steps = max(1, math.ceil(float(seconds) / timestep - 1e-6))
     rows = travelled(curve, int(ramp), steps)
     # Near the corners of a planned path there may be peaks between the samples of `timing`.
-    velocity, acceleration, jerk = limit_shares(np.concatenate([points[:1], rows]), timestep)
+    velocity, acceleration, jerk = limit_shares(np.concatenate([points[:1], rows]), timestep, arm)
     excess = max(velocity, acceleration ** (1 / 2), jerk ** (1 / 3)) / pace
     if excess > 1.0:
         rows = travelled(curve, int(ramp), math.ceil(steps * excess * (1.0 + SPARE)))

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.swept_cloud import Solid, cloud_of
 from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.kinematics import Numbers
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf
@@ -35,7 +36,7 @@ FINE = 0.5  # spacing of a cloud's points near the front, relative to the rest
 
 @dataclasses.dataclass(frozen=True)
 class Gripper:
-    """The two-finger gripper and how it is used [m].
+    """The two-finger gripper, how it is used, and the arm that carries it [m].
 
     Attributes:
       max_opening: largest distance between the fingers.
@@ -45,6 +46,7 @@ class Gripper:
         the last; a held object is taken to the first that is reachable, where even the longest object is outside the
         shelf. See `entry`.
       front: clouds are dense where z in the gripper frame is above this.
+      arm: that carries it; a `Workcell` sets it by its `ArmConfig.model`.
     """
 
     max_opening: float = 0.08
@@ -52,6 +54,7 @@ class Gripper:
     approach: float = 0.3
     outside: tuple[float, ...] = (0.26, 0.3, 0.34, 0.374)
     front: float = -0.08
+    arm: Arm = PANDA
 
     def __post_init__(self):
         for field in ("max_opening", "usable_opening", "approach"):
@@ -65,6 +68,11 @@ class Gripper:
             raise InputError(
                 f"Gripper: usable_opening ({self.usable_opening}) must not exceed max_opening ({self.max_opening})"
             )
+
+    def __repr__(self) -> str:
+        # Searches are saved with a digest of this text; those of a Panda go on, which had no arm in it.
+        names = [field.name for field in dataclasses.fields(self) if field.name != "arm" or self.arm != PANDA]
+        return f"Gripper({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
     @property
     def nearest_outside(self) -> float:

@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics of the Franka Emika Panda, in closed form and batched.
+"""Forward and inverse kinematics of the Franka Emika Panda and the FR3, in closed form and batched.
 
 The arm is described by modified Denavit-Hartenberg parameters (Craig's convention, from the maker's documentation).
 Its seventh joint is redundant: with joint 7 given, the hand's pose fixes the wrist centre W, where the axes of joints
@@ -13,6 +13,7 @@ the hand frame moved to between the finger tips: z is the approach direction, y 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,17 +24,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import back_off
+from mechsearch_jax.robot.arm_config import HOME, PANDA, Arm
 from mechsearch_jax.runtime.errors import InputError
 
 Numbers = Array | np.ndarray
 
-JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973], np.float32)
-JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973], np.float32)
-# The maker's limits for each joint: velocity [rad/s], acceleration [rad/s2], jerk [rad/s3].
-VELOCITY_LIMIT = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61], np.float32)
-ACCELERATION_LIMIT = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0], np.float32)
-JERK_LIMIT = 500.0 * ACCELERATION_LIMIT
-HOME = np.array([0.0301, -1.4702, 0.0279, -2.4376, 0.1466, 2.3087, 0.7012], np.float32)
 
 # One row for each joint: distance a [m] and angle alpha [quarter turns] along the previous x, distance d [m] along z.
 JOINTS = (
@@ -126,9 +121,9 @@ def gripper_pose(q: Float[Numbers, "*batch 7"]) -> Float[Array, "*batch 4 4"]:
     return _pose(x, y, z, p + FINGER_TIPS * z)
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="arm")
 def inverse_kinematics(
-    T_base_gripper: Float[Numbers, "*batch 4 4"], q7: Float[Numbers, "*#batch"]
+    T_base_gripper: Float[Numbers, "*batch 4 4"], q7: Float[Numbers, "*#batch"], arm: Arm = PANDA
 ) -> tuple[Float[Array, "*batch 4 7"], Bool[Array, "*batch 4"]]:
     """All joint angles with a bent elbow that reach a pose with joint 7 at a given angle, in closed form.
 
@@ -137,6 +132,7 @@ def inverse_kinematics(
     Args:
       T_base_gripper: pose of the gripper in the base frame.
       q7: angle of joint 7 [rad].
+      arm: whose limits hold; static.
 
     Returns:
       q: four solutions (two forearms times two shoulders, always in the same order) [rad]; finite but meaningless
@@ -146,7 +142,7 @@ def inverse_kinematics(
     """
     T = jnp.asarray(T_base_gripper, jnp.float32)
     q7 = jnp.broadcast_to(jnp.asarray(q7, jnp.float32), T.shape[:-2])
-    four = _solutions(T, q7)
+    four = _solutions(T, q7, arm)
     rest = [jnp.broadcast_to(four.q4, four.wrist[0].shape), *four.wrist, jnp.broadcast_to(q7, four.wrist[0].shape)]
     # Axes: joints, shoulders, forearms.
     q = jnp.stack([jnp.stack([*shoulder, *rest]) for shoulder in four.shoulders], axis=1)
@@ -171,7 +167,7 @@ class _Solutions(NamedTuple):
     valid: tuple[Array, Array]
 
 
-def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _Solutions:
+def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"], arm: Arm) -> _Solutions:
     """See `inverse_kinematics`.
 
     Written in single coordinates: XLA fuses elementwise arithmetic into one GPU kernel, but not stacks and slices.
@@ -203,7 +199,7 @@ def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _S
     middle = jnp.arctan2(along_x, along_y)
 
     sign = np.array([1.0, -1.0], np.float32).reshape(2, *[1] * (q7.ndim - 1))
-    centre = float(JOINT_LOWER[5] + JOINT_UPPER[5]) / 2
+    centre = float(arm.lower[5] + arm.upper[5]) / 2
     q6 = middle + sign * opening
     q6 = q6 - 2.0 * math.pi * jax.lax.round((q6 - centre) / (2.0 * math.pi))
     c6, s6 = jnp.cos(q6), jnp.sin(q6)
@@ -228,18 +224,18 @@ def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _S
     # there the line from the wrist to the shoulder differs from the one that joint 4 gives.
     off = jnp.sqrt(off * off + along_z * along_z) - (_OFFSET - _OFFSET * c4 - _UPPER * s4)
     back = s6 * along_x + c6 * along_y + (_FORE - _OFFSET * s4 + _UPPER * c4)
-    reached = (off * off + back * back < POSITION_TOLERANCE**2) & _within(q4, 3) & _within(q7, 6)
-    reached &= _within(q2, 1) & _within(q5, 4) & _within(q6, 5)
+    reached = (off * off + back * back < POSITION_TOLERANCE**2) & _within(arm, q4, 3) & _within(arm, q7, 6)
+    reached &= _within(arm, q2, 1) & _within(arm, q5, 4) & _within(arm, q6, 5)
     # The other shoulder turns about the same axes to the same upper arm.
     other = _opposite(q1), -q2, _opposite(q3)
     shoulders = (q1, q2, q3), other
-    valid = [reached & _within(a[0], 0) & _within(a[2], 2) for a in shoulders]
+    valid = [reached & _within(arm, a[0], 0) & _within(arm, a[2], 2) for a in shoulders]
     return _Solutions(shoulders, q4, (q5, q6), (valid[0], valid[1]))
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="arm")
 def path_kinematics(
-    T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"]
+    T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"], arm: Arm = PANDA
 ) -> tuple[Float[Array, "*batch waypoints 7"], Bool[Array, "*batch"]]:
     """Joint angles along a path of gripper poses, with joint 7 at rest.
 
@@ -250,23 +246,24 @@ def path_kinematics(
     Args:
       T_base_gripper: poses along the path in the base frame.
       q7: angle of joint 7 [rad].
+      arm: whose limits hold; static.
 
     Returns:
       q: joint angles at the waypoints [rad]; finite, but meaningless, where the path is out of reach.
       reachable: whether there is such a solution.
     """
-    q, reachable = path_joints(T_base_gripper, q7)
+    q, reachable = path_joints(T_base_gripper, q7, arm)
     return jnp.stack(q, axis=-1), reachable
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="arm")
 def path_joints(
-    T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"]
+    T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"], arm: Arm = PANDA
 ) -> tuple[list[Float[Array, "*batch waypoints"]], Bool[Array, "*batch"]]:
     """`path_kinematics`, with one array of angles for each joint."""
     T = jnp.asarray(T_base_gripper, jnp.float32)
     q7 = jnp.broadcast_to(jnp.asarray(q7, jnp.float32), T.shape[:-3])
-    four = _solutions(T, q7[..., None])
+    four = _solutions(T, q7[..., None], arm)
 
     step = T[..., 1:, :3, :] - T[..., :-1, :3, :]
     step = step * step
@@ -360,9 +357,9 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _within(q: Array, joint: int) -> Array:
+def _within(arm: Arm, q: Array, joint: int) -> Array:
     """Whether angles of a joint lie within its limits."""
-    low, high = float(JOINT_LOWER[joint]), float(JOINT_UPPER[joint])
+    low, high = float(arm.lower[joint]), float(arm.upper[joint])
     return jnp.abs(q) <= high if low == -high else (q >= low) & (q <= high)
 
 

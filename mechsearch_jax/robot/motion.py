@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.geometry.transforms import translate
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.entry import way_in, ways_in
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import path_kinematics
@@ -89,6 +90,12 @@ class MotionConfig:
             raise InputError(f"MotionConfig: carry_pace {self.carry_pace} must be above 0 and at most 1")
 
 
+def motion_with(gripper: Gripper, config: MotionConfig | None) -> MotionConfig:
+    """The configuration, on the arm of this gripper; the default with this gripper if None."""
+    config = config or MotionConfig(gripper=gripper)
+    return dataclasses.replace(config, gripper=dataclasses.replace(config.gripper, arm=gripper.arm))
+
+
 class Reference(flax.struct.PyTreeNode):
     """What the controller follows, one row for each time step. The last row is repeated when the motion is over.
 
@@ -150,7 +157,7 @@ def _respaced(given: int, count: int) -> np.ndarray:
     return spline(np.linspace(0, given - 1, count)).astype(np.float32)
 
 
-def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple[Reference, Array]:
+def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float, arm: Arm = PANDA) -> tuple[Reference, Array]:
     """The motion along joint angles `q` (waypoints, 7) by the stretches, without pauses between them.
 
     Returns:
@@ -161,8 +168,10 @@ def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple
     least = np.array([s.longest if s.first == s.last else s.least for s in stretches])
     longest = np.array([s.longest for s in stretches])
     points = jnp.stack([_points(q, s, count) for s in stretches])
-    curves = jax.vmap(smooth_curve)(points)
-    seconds, ramp = jax.vmap(timing)(curves, jnp.asarray(least * timestep, jnp.float32), pace)
+    curves = jax.vmap(lambda p: smooth_curve(p, arm))(points)
+    seconds, ramp = jax.vmap(lambda *given: timing(*given, arm))(
+        curves, jnp.asarray(least * timestep, jnp.float32), pace
+    )
 
     needed = jnp.maximum(jnp.ceil(seconds / timestep / GRAIN - 1e-3) * GRAIN, least)
     # Stretches of zero length, such as the crossing to a pre-grasp outside, are left out.
@@ -221,7 +230,7 @@ def push_reference(
             way_in(released, gripper.nearest_outside, gripper, n - 1, n)[::-1][1:],
         ]
     )
-    q, reachable = path_kinematics(path, q7)
+    q, reachable = path_kinematics(path, q7, gripper.arm)
     closed = (0.0, 0.0)
     corners = [int(i) * (n - 1) for i in range(7)]
     longest = (config.leave_longest, config.approach_longest, config.push_longest, config.release_longest)
@@ -231,7 +240,7 @@ def push_reference(
         _Stretch(most, first, last, closed, fewest)
         for most, first, last, fewest in zip(longest, corners[:-1], corners[1:], least, strict=True)
     )
-    reference, in_time = _schedule(q, stretches, config.timestep)
+    reference, in_time = _schedule(q, stretches, config.timestep, config.gripper.arm)
     return reference, reachable & in_time
 
 
@@ -250,7 +259,8 @@ def retrieve_reference(
       The reference, and whether the arm reaches all of it, in time.
     """
     q, reachable = _entry(T_world_gripper, q7, config)
-    reference, in_time = _schedule(q[::-1], _pick_stretches(opening, config), config.timestep)
+    stretches = _pick_stretches(opening, config)
+    reference, in_time = _schedule(q[::-1], stretches, config.timestep, config.gripper.arm)
     return reference, reachable & in_time
 
 
@@ -290,7 +300,7 @@ def pick_and_place_reference(
         _Stretch(config.approach_longest, last, front, (opened, opened)),
         _Stretch(config.leave_longest, front, outside, (opened, opened)),
     )
-    reference, in_time = _schedule(q, stretches, config.timestep)
+    reference, in_time = _schedule(q, stretches, config.timestep, config.gripper.arm)
     return reference, pick_reachable & place_reachable & in_time
 
 

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.hand import HandEvent
-from mechsearch_jax.robot.kinematics import (
-    ACCELERATION_LIMIT,
-    JERK_LIMIT,
-    JOINT_LOWER,
-    JOINT_UPPER,
-    VELOCITY_LIMIT,
-)
 from mechsearch_jax.runtime.errors import InputError
 
 
@@ -49,8 +45,8 @@ class Bounds:
         for name in ("tracking", "force"):
             if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
                 raise InputError(f"Bounds: {name} {getattr(self, name)} must be a positive number")
-        if len(self.effort) != len(JOINT_LOWER) or not all(0 < e < math.inf for e in self.effort):
-            raise InputError(f"Bounds: effort {self.effort} must be {len(JOINT_LOWER)} positive torques in N m")
+        if len(self.effort) != 7 or not all(0 < e < math.inf for e in self.effort):
+            raise InputError(f"Bounds: effort {self.effort} must be 7 positive torques in N m")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +110,7 @@ class RobotTrajectory:
       ends_at_home: False if home is not free and the arm stops outside the shelf.
       events: what the hand does, in order; where an event `waits`, and where any ends, the arm stands still.
       place_fault: why the target stays in the hand though there is a place for it; empty if it does not.
+      arm: that it was made for.
     """
 
     time: Float[np.ndarray, " t"]
@@ -130,6 +127,7 @@ class RobotTrajectory:
     ends_at_home: bool
     events: tuple[HandEvent, ...] = ()
     place_fault: str = ""
+    arm: Arm = PANDA
 
     @property
     def put_down(self) -> int | None:
@@ -140,8 +138,8 @@ class RobotTrajectory:
     def report(self) -> Report:
         """Duration, shares of the limits and clearance."""
         timestep = self.time[1] - self.time[0] if len(self.time) > 1 else 1.0
-        shares = limit_shares(self.position, float(timestep))
-        margin = np.minimum(self.position - JOINT_LOWER, JOINT_UPPER - self.position).min()
+        shares = limit_shares(self.position, float(timestep), self.arm)
+        margin = np.minimum(self.position - self.arm.lower, self.arm.upper - self.position).min()
         return Report(
             float(self.time[-1]),
             float(margin),
@@ -153,22 +151,42 @@ class RobotTrajectory:
         )
 
 
-def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[float, float, float]:
-    """Largest shares of the limits of velocity, acceleration and jerk, by differences of rows, from rest to rest."""
+def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float, arm: Arm = PANDA) -> tuple[float, float, float]:
+    """Largest shares of an arm's limits of velocity, acceleration and jerk, by differences of rows, from rest to rest.
+
+    Where the limit of the velocity depends on the position, the smaller of those at both rows counts.
+    """
     first, last = (np.repeat(end, 3, axis=0) for end in (position[:1], position[-1:]))
-    values, shares = np.concatenate([first, position, last]), []
-    for limit in (VELOCITY_LIMIT, ACCELERATION_LIMIT, JERK_LIMIT):
-        values = np.diff(values, axis=0) / timestep
-        shares.append(float((np.abs(values) / limit).max()))
-    return shares[0], shares[1], shares[2]
+    position = np.concatenate([first, position, last])
+    velocity = np.diff(position, axis=0) / timestep
+    acceleration = np.diff(velocity, axis=0) / timestep
+    jerk = np.diff(acceleration, axis=0) / timestep
+    speeds = np.minimum(arm.speeds(position[:-1], velocity), arm.speeds(position[1:], velocity))
+    limits = (speeds, np.array(arm.acceleration, np.float32), np.array(arm.jerk, np.float32))
+    by_velocity, by_acceleration, by_jerk = (
+        float((np.abs(values) / limit).max())
+        for values, limit in zip((velocity, acceleration, jerk), limits, strict=True)
+    )
+    return by_velocity, by_acceleration, by_jerk
 
 
-def derivatives(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities and accelerations of the smooth curve through rows, at rest at both ends; shapes (t, 7)."""
-    if len(position) < 2:
-        return np.zeros_like(position), np.zeros_like(position)
-    spline = CubicSpline(np.arange(len(position)) * timestep, position, bc_type="clamped")
-    return spline(spline.x, 1), spline(spline.x, 2)
+def derivatives(
+    position: Float[np.ndarray, "t 7"], timestep: float, rests: Iterable[int] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities and accelerations of the smooth curves through rows; shapes (t, 7).
+
+    Args:
+      position: the rows [rad].
+      timestep: between them [s].
+      rests: rows at which the arm is at rest, beside the first and the last; velocities are exactly 0 there.
+    """
+    velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
+    for first, last in itertools.pairwise(sorted({0, *rests, len(position) - 1})):
+        rows = slice(first, last + 1)
+        spline = CubicSpline(np.arange(last + 1 - first) * timestep, position[rows], bc_type="clamped")
+        velocity[rows], acceleration[rows] = spline(spline.x, 1), spline(spline.x, 2)
+        velocity[[first, last]] = 0.0
+    return velocity, acceleration
 
 
 def slowed(position: Float[np.ndarray, "t 7"], factor: float) -> Float[np.ndarray, "s 7"]:

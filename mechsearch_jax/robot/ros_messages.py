@@ -1,4 +1,4 @@
-"""Trajectories as ROS 2 messages: dictionaries with the fields of the message types, for JSON and for a node.
+"""Trajectories as ROS 2 messages: dictionaries with the fields of the message types, for a node, a bag or JSON.
 
 | what | type |
 |---|---|
@@ -17,11 +17,9 @@ from typing import Any
 import numpy as np
 
 from mechsearch_jax.robot.hand import HandEvent, HandGrasp
-from mechsearch_jax.robot.robot_trajectory import RobotTrajectory, derivatives
+from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
 
-# The first Panda's names; an FR3's are fr3_joint1 to fr3_joint7.
-JOINT_NAMES = tuple(f"panda_joint{i}" for i in range(1, 8))
 # Type of the action of each kind of event.
 ACTION_TYPES = {"move": "franka_msgs/action/Move", "grasp": "franka_msgs/action/Grasp"}
 # Position of a `GripperCommand` for each metre between the fingers: Franka's server takes that of one finger.
@@ -73,7 +71,7 @@ def _part_end(trajectory: RobotTrajectory, row: int) -> int:
 
 def joint_trajectory_message(
     trajectory: RobotTrajectory,
-    joint_names: Sequence[str] = JOINT_NAMES,
+    joint_names: Sequence[str] = (),
     first: int = 0,
     last: int | None = None,
     *,
@@ -81,29 +79,27 @@ def joint_trajectory_message(
 ) -> dict[str, Any]:
     """Rows of a trajectory as a `trajectory_msgs/msg/JointTrajectory`, with times from the first of them.
 
+    Sequences of numbers are arrays of double precision, as `rosbags` takes them; `rclpy` takes their `tolist()`.
+
     Args:
       trajectory: of the arm.
-      joint_names: of the seven joints, from the base.
+      joint_names: of the seven joints, from the base; the arm's own if left out.
       first, last: rows, both included, where the arm stands still; all of them by default.
       backward: whether it goes from `last` to `first`, along the same way.
 
     Raises:
       InputError: `joint_names` are not seven different names.
     """
-    names = [str(name) for name in joint_names]
-    if len(set(names)) != len(JOINT_NAMES) or len(names) != len(JOINT_NAMES):
-        raise InputError(f"joint_names: {names} must be {len(JOINT_NAMES)} different names")
+    names = [str(name) for name in joint_names or trajectory.arm.joint_names]
+    if len(set(names)) != 7 or len(names) != 7:
+        raise InputError(f"joint_names: {names} must be 7 different names")
     rows = slice(first, None if last is None else last + 1)
-    time, position = trajectory.time[rows] - trajectory.time[first], trajectory.position[rows]
-    position = position[::-1] if backward else position
-    whole = first == 0 and last is None and not backward
-    timestep = float(trajectory.time[1]) if len(trajectory.time) > 1 else 1.0
-    velocity, acceleration = (
-        (trajectory.velocity, trajectory.acceleration) if whole else derivatives(position, timestep)
-    )
+    way = (trajectory.position[rows], trajectory.velocity[rows], trajectory.acceleration[rows])
+    if backward:
+        way = (way[0][::-1], -way[1][::-1], way[2][::-1])
     points = [
-        {"positions": q, "velocities": v, "accelerations": a, "effort": [], "time_from_start": duration(t)}
-        for q, v, a, t in zip(position.tolist(), velocity.tolist(), acceleration.tolist(), time.tolist(), strict=True)
+        {"positions": q, "velocities": v, "accelerations": a, "effort": np.zeros(0), "time_from_start": duration(t)}
+        for q, v, a, t in zip(*way, trajectory.time[rows] - trajectory.time[first], strict=True)
     ]
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     return {"header": header, "joint_names": names, "points": points}
@@ -136,8 +132,8 @@ def gripper_command_goal(
     return {"command": {"position": float(share * width), "max_effort": float(force)}}
 
 
-def ros_messages(trajectory: RobotTrajectory, joint_names: Sequence[str] = JOINT_NAMES) -> dict[str, Any]:
-    """A trajectory and what the hand does as JSON values.
+def ros_messages(trajectory: RobotTrajectory, joint_names: Sequence[str] = ()) -> dict[str, Any]:
+    """A trajectory and what the hand does as JSON values: lists instead of arrays.
 
     `arm` is a `trajectory_msgs/msg/JointTrajectory` of all rows. `gripper` lists the hand's events: `type` of the
     action and its `goal`, the `start` and `duration` in the arm's time [s], whether the arm `waits`, and the same as
@@ -149,8 +145,11 @@ def ros_messages(trajectory: RobotTrajectory, joint_names: Sequence[str] = JOINT
     """
     bounds = trajectory.bounds
     number = {id(event): i for i, event in enumerate(trajectory.events)}
+    arm = joint_trajectory_message(trajectory, joint_names)
+    for point in arm["points"]:
+        point |= {name: value.tolist() for name, value in point.items() if isinstance(value, np.ndarray)}
     return {
-        "arm": joint_trajectory_message(trajectory, joint_names),
+        "arm": arm,
         "gripper": [
             {
                 "type": ACTION_TYPES[event.kind],

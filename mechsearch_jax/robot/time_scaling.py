@@ -6,7 +6,7 @@ velocity limits allow for each part. So the arm is slow near singularities, wher
 hand. The progress along the curve has a profile of unit duration, at rest and without acceleration at both ends: the
 speed rises as a cubic smoothstep, is constant, and falls likewise. Velocities, accelerations and jerks fall with the
 first, second and third power of the duration. So the largest of the three ratios to the limits, over all joints and
-places, gives the duration.
+places, gives the duration. On an arm whose speed is limited by the position, the limits at the places count.
 
 Approximation: peaks are evaluated at `PLACES` places of the curve. Differences of sampled references are averages of
 the derivatives, so sampling raises no peak.
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.interpolate import CubicSpline
 
-from mechsearch_jax.robot.kinematics import ACCELERATION_LIMIT, JERK_LIMIT, VELOCITY_LIMIT
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 
 # Candidate shares of a stretch's time in which its speed rises, and falls. Short ramps suit long stretches, which
 # velocities limit; the first of equally fast ones is chosen, which is closest to 3 u^2 - 2 u^3.
@@ -49,10 +49,11 @@ class Curve(flax.struct.PyTreeNode):
     bend: jax.Array
 
 
-def smooth_curve(q: Float[Array, "n 7"]) -> Curve:
-    """The curve through joint angles [rad] at waypoints, evenly spaced along the hand's way; n is at least 2."""
+def smooth_curve(q: Float[Array, "n 7"], arm: Arm = PANDA) -> Curve:
+    """An arm's curve through joint angles [rad] at waypoints, evenly spaced along the hand's way; n is at least 2."""
+    way = jnp.diff(q, axis=0)
     # A norm of high order instead of the maximum over the joints, which would make kinks.
-    fourth = jnp.sum((jnp.diff(q, axis=0) / VELOCITY_LIMIT[None]) ** 4, axis=1)
+    fourth = jnp.sum((way / arm.speeds((q[1:] + q[:-1]) / 2, way)) ** 4, axis=1)
     least = LEAST_SHARE * jnp.mean((fourth + LEAST_TIME**4) ** 0.25) + LEAST_TIME
     time = (fourth + least**4) ** 0.25
     for _ in range(SMOOTHINGS):
@@ -64,7 +65,7 @@ def smooth_curve(q: Float[Array, "n 7"]) -> Curve:
 
 
 def timing(
-    curve: Curve, least: Float[Array, ""] | float, pace: Float[Array, ""] | float = 1.0
+    curve: Curve, least: Float[Array, ""] | float, pace: Float[Array, ""] | float = 1.0, arm: Arm = PANDA
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """The least duration of the motion along a curve, and its profile.
 
@@ -72,12 +73,14 @@ def timing(
       curve: without leading axes.
       least: lower bound of the duration [s].
       pace: share of the limits that velocities may reach; accelerations reach its square, and jerks its cube.
+      arm: whose limits hold; static.
 
     Returns:
       The duration [s], and the index of the fastest of `RAMPS`.
     """
     segment = jnp.searchsorted(curve.knots, jnp.asarray(_PLACES), side="right", method="scan_unrolled") - 1
-    _, d1, d2, d3 = _derivatives(curve, jnp.clip(segment, 0, curve.knots.shape[0] - 2), jnp.asarray(_PLACES))
+    q, d1, d2, d3 = _derivatives(curve, jnp.clip(segment, 0, curve.knots.shape[0] - 2), jnp.asarray(_PLACES))
+    speeds = arm.speeds(q, d1)
     d1, d2, d3 = d1[None], d2[None], d3[None]
     rate, rate2, rate3 = (jnp.asarray(table)[..., None] for table in _RATES)
     velocity = d1 * rate
@@ -85,8 +88,12 @@ def timing(
     jerk = d3 * rate**3 + 3.0 * d2 * rate * rate2 + d1 * rate3
     # The lower bound is so small that its roots are far below a time step.
     ratios = [
-        jnp.maximum(jnp.max(jnp.abs(peak) / limit[None, None], axis=(1, 2)), 1e-12)
-        for peak, limit in ((velocity, VELOCITY_LIMIT), (acceleration, ACCELERATION_LIMIT), (jerk, JERK_LIMIT))
+        jnp.maximum(jnp.max(jnp.abs(peak) / limit, axis=(1, 2)), 1e-12)
+        for peak, limit in (
+            (velocity, speeds[None]),
+            (acceleration, np.array(arm.acceleration, np.float32)[None, None]),
+            (jerk, np.array(arm.jerk, np.float32)[None, None]),
+        )
     ]
     needed = jnp.maximum(ratios[0], jnp.maximum(ratios[1] ** (1 / 2), ratios[2] ** (1 / 3)))
     needed = jnp.maximum(needed / pace, least)

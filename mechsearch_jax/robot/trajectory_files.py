@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
-from mechsearch_jax.robot.ros_messages import JOINT_NAMES, ros_messages
+from mechsearch_jax.robot.ros_messages import ros_messages
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
@@ -36,7 +36,7 @@ def save_csv(trajectory: RobotTrajectory, path: PathLike, overwrite: bool = Fals
 
 
 def save_ros(
-    trajectory: RobotTrajectory, path: PathLike, overwrite: bool = False, joint_names: Sequence[str] = JOINT_NAMES
+    trajectory: RobotTrajectory, path: PathLike, overwrite: bool = False, joint_names: Sequence[str] = ()
 ) -> None:
     """Write `ros_messages` as JSON.
 

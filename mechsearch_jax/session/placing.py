@@ -11,8 +11,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.free_motion import WAYPOINTS
-from mechsearch_jax.robot.kinematics import JOINT_LOWER, JOINT_UPPER, gripper_pose, line_poses, path_kinematics
+from mechsearch_jax.robot.kinematics import gripper_pose, line_poses, path_kinematics
 from mechsearch_jax.runtime.errors import InputError
 
 # From how far above the target is brought down, how far above its place it is let go, and how far the hand backs away
@@ -45,6 +46,7 @@ def place_ways(
     T_world_gripper: Float[np.ndarray, "4 4"],
     T_world_target: Float[np.ndarray, "4 4"] | None,
     half_height: float,
+    arm: Arm = PANDA,
 ) -> list[PlaceWay]:
     """Ways to a place and back that the arm reaches, the best first; whether they are free is not tested.
 
@@ -53,12 +55,13 @@ def place_ways(
       T_world_gripper: pose of the gripper where it grasped the target.
       T_world_target: pose of the target then; None if it is not known.
       half_height: of the target [m].
+      arm: whose limits hold.
 
     Raises:
       InputError: there is none.
     """
     if len(place) == 7:
-        return [_of_joints(np.array(place, float))]
+        return [_of_joints(np.array(place, float), arm)]
     if T_world_target is None:
         raise InputError("place: the target was not seen, and how it lies in the hand is not known")
     x, y, z = place
@@ -69,9 +72,9 @@ def place_ways(
     placed[:, :3, 3] = (x, y, z + half_height + RELEASE)
     grippers = placed @ np.linalg.inv(T_world_target) @ T_world_gripper
     # Joint 7 rests on the way down and back; the way to it is planned.
-    wrists = np.linspace(JOINT_LOWER[6], JOINT_UPPER[6], WRISTS + 2)[1:-1].astype(np.float32)
+    wrists = np.linspace(arm.lower[6], arm.upper[6], WRISTS + 2)[1:-1].astype(np.float32)
     paths = np.stack([_path(T) for T in grippers])
-    q, reached = path_kinematics(np.repeat(paths, WRISTS, axis=0), np.tile(wrists, len(TURNS)))
+    q, reached = path_kinematics(np.repeat(paths, WRISTS, axis=0), np.tile(wrists, len(TURNS)), arm)
     q, reached = np.asarray(q, float), np.asarray(reached)
     reachable = np.flatnonzero(reached)
     if not len(reachable):
@@ -87,10 +90,10 @@ def _path(T: np.ndarray) -> np.ndarray:
     return np.concatenate([down, back[1:]]).astype(np.float32)
 
 
-def _of_joints(q: np.ndarray) -> PlaceWay:
+def _of_joints(q: np.ndarray, arm: Arm) -> PlaceWay:
     """The way back from joint angles, straight along the gripper's axis, if the arm can go it from there."""
     back = np.asarray(line_poses(gripper_pose(q), np.array(BACK, np.float32), WAYPOINTS))[::-1]
-    angles, reached = path_kinematics(back, np.float32(q[6]))
+    angles, reached = path_kinematics(back, np.float32(q[6]), arm)
     angles = np.asarray(angles, float)
     if not bool(reached) or np.abs(angles[0] - q).max() > 1e-2:
         return PlaceWay(q[None], q[None], None)

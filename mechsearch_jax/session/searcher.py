@@ -40,9 +40,9 @@ from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.arm_config import check_joints
 from mechsearch_jax.robot.hand import checked_width
-from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.robot.motion import motion_with
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.session import faults, warming
@@ -206,7 +206,7 @@ class Searcher:
         problem, key = self.problem, jax.random.key(0)
         images = warming.images(self.workcell.camera, self.workcell.shelf, colour, mask, target_id)
         config = self._trajectories.motion if self._trajectories else None
-        first = first_decision(problem, self._policy, config or MotionConfig(gripper=problem.gripper))
+        first = first_decision(problem, self._policy, motion_with(problem.gripper, config))
         # The longest programs are compiled in threads while the stages run, which wait for them where they call them.
         with prepared(first, lambda text: None):
             stage()
@@ -343,7 +343,7 @@ class Searcher:
         """
         if joints is not None:
             joints = np.asarray(joints, float)
-            check_joints("joints", joints)
+            check_joints("joints", joints, self.workcell.gripper.arm)
         return Present(joints, None if width is None else checked_width(width, self.problem.gripper.max_opening))
 
     def _learned(self, observation: Observation) -> LearnedFriction | None:

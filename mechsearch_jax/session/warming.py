@@ -20,7 +20,7 @@ from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.trials import PLANNED, Trials, scenes_of
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.robot.motion import MotionConfig, motion_with
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.camera import Camera
@@ -114,7 +114,7 @@ def fixed_recogniser(recogniser: Any, observation: Observation) -> Callable[...,
 def motions(problem: Problem, action: Action, config: MotionConfig | None) -> None:
     """Compile the reference motions of all kinds of action."""
     for kind in KINDS.values():
-        reference_motion(kind, action, config or MotionConfig(gripper=problem.gripper))
+        reference_motion(kind, action, motion_with(problem.gripper, config))
 
 
 def trials(tries: Trials, problem: Problem, belief: Belief, observation: Observation, action: Action) -> None:

@@ -20,12 +20,12 @@ from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearance, tip_positions
-from mechsearch_jax.robot.arm_config import check_place
-from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, check_joints, free_motion, timed_rows
+from mechsearch_jax.robot.arm_config import check_joints, check_place
+from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, free_motion, timed_rows
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig, HandMove, checked_width, longest_way, stroke
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part, RobotTrajectory, derivatives
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.placing import PlaceWay, place_ways
@@ -119,8 +119,10 @@ def whole_trajectory(
     config = config or TrajectoryConfig()
     home = np.array(HOME if home is None else home, float)
     joints = home if joints is None else np.array(joints, float)
-    check_joints("home", home)
-    check_joints("joints", joints)
+    arm = problem.gripper.arm
+    check_joints("home", home, arm)
+    check_joints("joints", joints, arm)
+    check_place("TrajectoryConfig: place", config.place, arm)
     if not 0.0 < speed <= 1.0:
         raise InputError(f"speed: {speed} must be above 0 and at most 1, a share of the joints' limits")
     width = None if width is None else checked_width(width, problem.gripper.max_opening)
@@ -145,7 +147,7 @@ class _Assembly:
     ):
         self.problem, self.observation, self.action, self.after = problem, observation, action, after
         self.config, self.speed, self.hand = config, speed, config.hand or HandConfig()
-        self.motion = config.motion or MotionConfig(gripper=problem.gripper)
+        self.motion = motion_with(problem.gripper, config.motion)
         self.kind: Kind = kind_of(int(action.kind))
 
     def run(self, joints: np.ndarray, home: np.ndarray, width: float | None) -> RobotTrajectory:
@@ -204,7 +206,13 @@ class _Assembly:
         what = grasped(self.problem, self.observation, self.action)
         T_world_gripper = np.asarray(self.action.T_world_gripper, float)
         foot = self.problem.target.solid.bottom
-        ways = place_ways(self.config.place, T_world_gripper, what.T_world_object if what.seen else None, foot)
+        ways = place_ways(
+            self.config.place,
+            T_world_gripper,
+            what.T_world_object if what.seen else None,
+            foot,
+            self.motion.gripper.arm,
+        )
         fault: InputError | None = None
         for way in ways:
             try:
@@ -232,11 +240,11 @@ class _Assembly:
         )
         parts = [Rows(there.position, np.full(len(there.position), held), np.full(len(there.position), force))]
         if len(way.down) > 1:
-            q = timed_rows(way.down, timestep, pace)
+            q = timed_rows(way.down, timestep, pace, arm=self.motion.gripper.arm)
             parts.append(Rows(q, np.full(len(q), held), np.full(len(q), force)))
         parts.append(opening_to(way.down[-1], held, opened, self.hand, timestep))
         if len(way.back) > 1:
-            q = timed_rows(way.back, timestep, pace)
+            q = timed_rows(way.back, timestep, pace, arm=self.motion.gripper.arm)
             parts.append(Rows(q, np.full(len(q), opened), np.zeros(len(q))))
         if way.T_world_placed is not None:
             around = self._obstacles(afterwards=True, placed=way.T_world_placed)
@@ -312,6 +320,7 @@ class _Assembly:
                 pace=self.speed * pace,
                 least=least,
                 config=self.config.free,
+                arm=self.motion.gripper.arm,
             )
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
@@ -352,7 +361,7 @@ class _Assembly:
         timestep = self.motion.timestep
         rows = joined([stage.rows for stage in stages], timestep)
         position = np.concatenate([joints[None], rows.position])
-        velocity, acceleration = derivatives(position, timestep)
+        velocity, acceleration = derivatives(position, timestep, rows.rests)
         ways = [stage.way for stage in stages if stage.way is not None]
         return RobotTrajectory(
             time=np.arange(len(position)) * timestep,
@@ -369,6 +378,7 @@ class _Assembly:
             ends_at_home=at_home,
             events=rows.events,
             place_fault=fault,
+            arm=self.motion.gripper.arm,
         )
 
 

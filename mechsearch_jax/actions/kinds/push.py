@@ -86,7 +86,7 @@ def motion_free(
     into, back = jax.vmap(lambda T: way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n))(
         jnp.stack([start, end])
     )
-    q, follows = arm_path(jnp.concatenate([into, push[1:], back[::-1][1:]]), action.q7, shelf)
+    q, follows = arm_path(jnp.concatenate([into, push[1:], back[::-1][1:]]), action.q7, shelf, gripper.arm)
     begins, ends = len(into), len(into) + n - 1
     # Poses at most 5 cm apart; those before the push are tested against the objects before it.
     stretches = q[:begins:2], q[begins:ends:3], q[ends::2]
@@ -205,7 +205,7 @@ class Push:
             middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
             into, out = crossing_poses(jnp.stack([T, end]), outside, gripper, FEW_CROSSINGS)
             push = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
-            follows = arm_follows(jnp.concatenate([into, push, out[::-1]]), q7, shelf)
+            follows = arm_follows(jnp.concatenate([into, push, out[::-1]]), q7, shelf, gripper.arm)
             return follows & ~cloud_hits_shelf(shelf, end, taken(clouds, cloud[None])[0])
 
         q7, cloud = jnp.repeat(tables.q7[CLOSED, wrist], d), np.repeat(cloud_index(tables, CLOSED, wrist), d)
