@@ -12,6 +12,7 @@ from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.edges import edge_faults, mask_faults
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
     check_measured,
@@ -57,6 +58,7 @@ def image_warnings(setting: Setting, recogniser: Any, images: Images, observatio
     camera, shelf, depth, target_id = setting.camera, setting.shelf, images.depth, images.target_id
     mask, colour = (None if image is None else np.asarray(image) for image in (images.mask, images.colour))
     faults = list(image_faults(camera, shelf, depth, mask))
+    faults += [*edge_faults(camera, shelf, depth, colour), *mask_faults(camera, shelf, depth, mask)]
     # Another recogniser may identify the target in another way.
     if isinstance(recogniser, Recogniser):
         faults += identity_faults(colour, mask, target_id)
