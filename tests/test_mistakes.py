@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import grey_dilation, minimum_filter
 
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.images.image_files import (
@@ -127,6 +128,9 @@ MISTAKES = {
     "depth: most pixels not measured": lambda tmp: look(
         np.where(np.arange(DEPTH.size).reshape(DEPTH.shape) % 3, 0, DEPTH)
     ),
+    "depth: nearer things reach beyond their edges, as where a stereo camera matches blocks": lambda tmp: look(
+        minimum_filter(np.where(DEPTH > 0, DEPTH, np.inf), 5)
+    ),
     "depth: complex, boolean or other numbers": lambda tmp: look(DEPTH > 0.5),
     "depth: no array": lambda tmp: look("depth.png"),
     "depth file: 8 bits": lambda tmp: picture(tmp, np.zeros((9, 16), np.uint8), load_depth),
@@ -142,6 +146,8 @@ MISTAKES = {
     "mask: of another size": lambda tmp: look(mask=MASK[::2, ::2]),
     "mask: floats": lambda tmp: look(mask=MASK.astype(np.float32)),
     "mask: names nothing": lambda tmp: look(mask=np.full_like(MASK, -1), target_id=-1),
+    "mask: shifted by 8 pixels": lambda tmp: look(mask=np.roll(MASK, 8, 1), target_id=-1),
+    "mask: 6 pixels too large": lambda tmp: look(mask=grey_dilation(MASK, size=(13, 13)), target_id=-1),
     "mask file: the background's number is not given": lambda tmp: picture(
         tmp, np.zeros((12, 12), np.uint8), lambda path: load_mask(path, 255)
     ),

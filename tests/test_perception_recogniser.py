@@ -107,6 +107,11 @@ def test_without_a_measurement_is_zero_or_nan(see, images, masked):
     assert same(see(KEY, holes, mask=images.mask), masked)
 
 
+def test_the_same_images_give_the_same_objects_with_every_key(see, images, masked):
+    for seed in (1, 2):
+        assert same(see(jax.random.key(seed), images.depth, mask=images.mask), masked)
+
+
 def test_a_target_that_the_mask_names_is_found_where_it_stands(named, masked):
     assert named.target_visible
     assert np.linalg.norm(np.asarray(named.target_pose)[:2] - IN_SIGHT.target.position[:2]) < 0.003

@@ -107,6 +107,29 @@ def test_visible_objects_are_refined_to_their_true_shapes(noise, least):
     assert np.all(up[:, [0, 1, 2, 4]] > 0.9998)
 
 
+@pytest.mark.parametrize(
+    ("axis", "place", "stays"),
+    [
+        (0, SHELF.back - 0.001, True),
+        (0, SHELF.back + 0.001, False),
+        (0, SHELF.front - 0.05, True),
+        (0, SHELF.front - 0.07, False),
+        (1, SHELF.right - 0.001, False),
+        (1, SHELF.left + 0.001, False),
+        (2, SHELF.board - 0.001, False),
+        (2, SHELF.ceiling + 0.001, False),
+    ],
+)
+def test_an_object_whose_centre_is_outside_of_the_shelf_is_none(axis, place, stays):
+    """Without points of its own it stays where it was guessed."""
+    points, labels, depth, truth = measured([SCENE], np.random.default_rng(0), 0.001)
+    guess = truth.replace(position=truth.position.at[:, 1, axis].set(place))
+    refined = refiner()(guess, points, jnp.where(labels == 1, -1, labels), depth)
+    expected = np.array(truth.valid)
+    expected[:, 1] = stays
+    np.testing.assert_array_equal(refined.scene.valid, expected)
+
+
 @pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not beside this checkout")
 @pytest.mark.slow
 def test_published_scenes_with_noise():

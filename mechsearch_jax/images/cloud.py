@@ -32,6 +32,13 @@ OVERHANG = 0.06
 BLOCK = 8
 # Pixels in a block of `draw`.
 _BLOCK = 64
+# Neighbouring pixels are on different surfaces if their points are farther apart by this than those beside them, of
+# whose distance slanted surfaces explain no more than the second length [m].
+_JUMP, _STEEPEST = 0.01, 0.02
+# Rounds of spreading the numbers of connected pixels; each doubles how far they reach.
+_SPREADS = 12
+# Surfaces of at least so many pixels have at least so many points in a cloud.
+_SMALL, _LEAST = 16, 24
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("camera", "row", "column"), meta_fields=("stride",))
@@ -176,6 +183,51 @@ def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = 
     return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
 
 
+def numbered(down: Bool[Array, "h-1 w"], right: Bool[Array, "h w-1"]) -> Int[Array, "h w"]:
+    """A number for each pixel, the same for connected pixels: that of one of them in the order of rows.
+
+    Each round takes the least number of the neighbours, and of the pixel that has the number.
+
+    Args:
+      down, right: whether each pixel is connected with the one below it, and with the one to its right.
+    """
+    height, width = right.shape[0], down.shape[1]
+    number = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
+
+    def spread(_, number):
+        big = jnp.int32(height * width)
+        lower = jnp.pad(jnp.where(down, number[1:], big), ((0, 1), (0, 0)), constant_values=height * width)
+        upper = jnp.pad(jnp.where(down, number[:-1], big), ((1, 0), (0, 0)), constant_values=height * width)
+        after = jnp.pad(jnp.where(right, number[:, 1:], big), ((0, 0), (0, 1)), constant_values=height * width)
+        before = jnp.pad(jnp.where(right, number[:, :-1], big), ((0, 0), (1, 0)), constant_values=height * width)
+        least = jnp.minimum(number, jnp.minimum(jnp.minimum(lower, upper), jnp.minimum(after, before)))
+        flat = number.reshape(-1)
+        flat = flat.at[flat].min(least.reshape(-1))
+        flat = flat[flat]
+        return flat[flat].reshape(height, width)
+
+    return jax.lax.fori_loop(0, _SPREADS, spread, number)
+
+
+def surfaces(points: Float[Array, "h w 3"], standing: Bool[Array, "h w"]) -> Int[Array, "h w"]:
+    """A number for each pixel, the same for the pixels of a surface: those that are connected without a jump in depth.
+
+    Args:
+      points: [m]; NaN where nothing was measured.
+      standing: the pixels that are connected; the others have numbers of their own.
+    """
+
+    def connected(axis):
+        step = jnp.linalg.norm(jnp.diff(points, axis=axis), axis=-1)
+        count = step.shape[axis]
+        padded = jnp.pad(jnp.nan_to_num(step), [(1, 1) if a == axis else (0, 0) for a in range(2)])
+        before, after = (jax.lax.slice_in_dim(padded, i, i + count, axis=axis) for i in (0, 2))
+        both = [jax.lax.slice_in_dim(standing, i, i + count, axis=axis) for i in (0, 1)]
+        return both[0] & both[1] & (step < _JUMP + jnp.minimum(jnp.maximum(before, after), _STEEPEST))
+
+    return numbered(connected(0), connected(1))
+
+
 def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:
     """Random indices of true elements in ascending order, one from each of `count` equal shares of them.
 
@@ -196,11 +248,29 @@ def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[In
     return jnp.where(total > 0, index, 0).astype(jnp.int32), total
 
 
-def resample(key: Key[Array, ""], cloud: PointCloud, count: int = POINTS) -> PointCloud:
+def resample(
+    key: Key[Array, ""], cloud: PointCloud, count: int = POINTS, surface: Int[Array, " p"] | None = None
+) -> PointCloud:
     """A cloud of `count` of the valid points, up- or down-sampled at random (paper appendix B.1).
 
     A cloud without valid points stays without.
+
+    Args:
+      key: PRNG key.
+      cloud: the points.
+      count: how many are drawn.
+      surface: the number of each point's surface, below the number of points. Of each with at least `_SMALL` points
+        `_LEAST` are drawn, as far as it has so many; without it small surfaces may be left out.
     """
-    index, total = draw(key, cloud.valid, count)
+    if surface is None:
+        index, total = draw(key, cloud.valid, count)
+    else:
+        total = jnp.sum(cloud.valid, dtype=jnp.int32)
+        size = jnp.zeros(cloud.valid.size, jnp.int32).at[surface].add(cloud.valid.astype(jnp.int32))[surface]
+        most = jnp.where(size >= _SMALL, jnp.minimum(size, _LEAST) / jnp.maximum(size, 1), 0.0)
+        ends = jnp.cumsum(jnp.where(cloud.valid, jnp.maximum(1.0, most * total / count), 0.0))
+        share = (jnp.arange(count) + jax.random.uniform(key, (count,))) / count
+        index = jnp.searchsorted(ends, share * ends[-1], side="right", method="scan")
+        index = jnp.minimum(index, cloud.valid.size - 1)
     taken = jax.tree.map(lambda a: a[index], cloud)
     return taken.replace(valid=jnp.broadcast_to(total > 0, (count,)))

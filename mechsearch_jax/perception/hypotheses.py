@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.images.cloud import numbered
 from mechsearch_jax.images.labels import MISSING
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_with_error
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
@@ -21,38 +22,17 @@ SLOTS = 8
 WAYS = 3
 # Ways whose parts differ in less than this share of the segment's pixels are one.
 _ALIKE = 0.05
-# Rounds of spreading the numbers of connected pixels; each doubles how far they reach.
-_SPREADS = 12
 
 
 def connected(points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float) -> Int[Array, "h w"]:
-    """A number for each pixel, the same for connected pixels of a segment.
-
-    Each round takes the least number of the neighbours, and of the pixel that has the number.
-    """
-    height, width = labels.shape
-    number = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
+    """A number for each pixel, the same for connected pixels of a segment."""
 
     def near(axis):
         apart = jnp.linalg.norm(jnp.diff(points, axis=axis), axis=-1)
         first, second = (jax.lax.slice_in_dim(labels, i, labels.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
         return (first == second) & (apart < jump)
 
-    down, right = near(0), near(1)
-
-    def spread(_, number):
-        big = jnp.int32(height * width)
-        lower = jnp.pad(jnp.where(down, number[1:], big), ((0, 1), (0, 0)), constant_values=height * width)
-        upper = jnp.pad(jnp.where(down, number[:-1], big), ((1, 0), (0, 0)), constant_values=height * width)
-        after = jnp.pad(jnp.where(right, number[:, 1:], big), ((0, 0), (0, 1)), constant_values=height * width)
-        before = jnp.pad(jnp.where(right, number[:, :-1], big), ((0, 0), (1, 0)), constant_values=height * width)
-        least = jnp.minimum(number, jnp.minimum(jnp.minimum(lower, upper), jnp.minimum(after, before)))
-        flat = number.reshape(-1)
-        flat = flat.at[flat].min(least.reshape(-1))
-        flat = flat[flat]
-        return flat[flat].reshape(height, width)
-
-    return jax.lax.fori_loop(0, _SPREADS, spread, number)
+    return numbered(near(0), near(1))
 
 
 def _two_means(points: Float[Array, "p 3"], member: Bool[Array, " p"]) -> Bool[Array, " p"]:

@@ -24,6 +24,7 @@ from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.edges import on_own_surfaces
 from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
@@ -173,7 +174,8 @@ class Recogniser:
         slot. Without a mask, the order of the slots is arbitrary.
 
         Args:
-          key: PRNG key of the drawn points.
+          key: for recognisers that draw at random, which are called alike; the same images give the same observation
+            with every key.
           depth: float (H, W), metres along the camera's z; 0, NaN or 65.535 where nothing was measured, infinite where
             there is nothing for at least 3 m.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
@@ -206,7 +208,8 @@ class Recogniser:
         Args:
           key, depth, colour, mask, target_id: as above; they are not checked.
         """
-        keys = jax.random.split(key, 3)
+        # Not of the caller's key, lest an object be seen or not by chance.
+        keys = jax.random.split(jax.random.key(0), 3)
         image, visible, share = _labelled(self, keys[0], depth, colour, mask, target_id)
         fitter = self.fitter if mask is None else self.mask_fitter
         settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
@@ -245,7 +248,7 @@ def _labelled(
         # As objects, small segments would rule out the pose of a target that is not detected.
         labels = recogniser.segmenter(key, shelf, points, of_target | detection.unclear)
     else:
-        instances = _instances(view.of(jnp.asarray(mask)))
+        instances = on_own_surfaces(points, _instances(view.of(jnp.asarray(mask))), above_board(shelf, points))
         # The mask says what is one thing, so its colour alone tells the target from the others.
         coloured = jnp.zeros(seen.shape, bool)
         if image is not None:

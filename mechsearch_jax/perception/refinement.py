@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
+from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.perception.scores import EDGE
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project
@@ -427,7 +428,8 @@ def refine(
       config: static; the default if None.
 
     Returns:
-      the refined scene and diagnostics. Absent objects and those with too few points are unchanged.
+      the refined scene and diagnostics. Absent objects and those with too few points are unchanged. One whose centre
+      lies outside the shelf's faces, or more than `cloud.OVERHANG` in front of it, is none, and becomes absent.
     """
     config = config or RefinementConfig()
     origin = jnp.array(camera.position)
@@ -455,6 +457,7 @@ def refine(
         count = jnp.sum(evidence.point_weight).astype(jnp.int32)
         refined = Superquadrics(jnp.exp(shape.log_size), shape.exponents, shape.position, shape.rotation, given.valid)
         kept = jax.tree.map(lambda a, b: jnp.where(usable & jnp.isfinite(cost), a, b), refined, given)
+        kept = kept.replace(valid=kept.valid & above_board(shelf, kept.position, 0.0))
         return Refined(kept, cost, initial, count, best.astype(jnp.int32))
 
     return jax.vmap(refine_object)(scene, jnp.arange(scene.capacity))

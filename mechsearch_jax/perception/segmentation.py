@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.masked import masked_vmap
-from mechsearch_jax.images.cloud import above_board, cloud_of, middle, resample
+from mechsearch_jax.images.cloud import above_board, cloud_of, middle, resample, surfaces
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
@@ -186,7 +186,8 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
         objects = above_board(shelf, points) & ~of_target
-        cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)))
+        surface = surfaces(points, objects).reshape(-1)
+        cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface)
         output = apply_network(self.network, self.parameters, self._as_trained(shelf, cloud.points)[None])
         labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
         image_labels = spread_labels(points, objects, cloud.points, labels)

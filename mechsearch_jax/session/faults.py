@@ -13,6 +13,7 @@ from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.checks.usable import check_images
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.edges import edge_faults, mask_faults
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
     colour_faults,
@@ -63,6 +64,8 @@ def check_image(
 def image_warnings(setting: Setting, recogniser: Any, look: Look, target_id: int | None) -> list[str]:
     """Warnings about images that do not fit camera, shelf and target, beside the place of the shelf."""
     faults = list(image_faults(look))
+    faults += edge_faults(look.camera, look.shelf, look.depth, look.colour)
+    faults += mask_faults(look.camera, look.shelf, look.depth, look.mask)
     # Another recogniser may identify the target in another way.
     if isinstance(recogniser, Recogniser):
         faults += identity_faults(look, target_id)
