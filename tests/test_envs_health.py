@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import subprocess
+import sys
 
 import pytest
 
@@ -72,6 +73,18 @@ def test_the_caches_are_measured(tmp_path, monkeypatch):
     assert "every start takes minutes" in findings_of("cache")[0].says
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     assert [finding.says.split(":")[0] for finding in findings_of("cache")] == ["problems are not kept", "compilations"]
+
+
+@pytest.mark.parametrize("prefix", ["site/cmeel.prefix", "env"])
+def test_the_robots_meshes_are_found_without_a_module(tmp_path, monkeypatch, prefix):
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "site"), *(p for p in sys.path if "site-packages" not in p)])
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "env"))
+    (missing,) = findings_of("meshes")
+    assert (missing.state, missing.remedy) == (State.MISSING, "pip install 'mechsearch-jax[meshes]'")
+    folder = tmp_path / prefix / "share/example-robot-data/robots/panda_description/meshes/collision"
+    folder.mkdir(parents=True)
+    (found,) = findings_of("meshes")
+    assert (found.state, str(folder) in found.says) == (State.FINE, True)
 
 
 def test_a_problem_is_looked_for_in_the_cache(tmp_path, monkeypatch):

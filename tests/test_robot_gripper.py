@@ -1,8 +1,5 @@
 """The gripper's primitives against the real meshes, its clouds, and the arm against the shelf."""
 
-import pathlib
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mechsearch_jax.envs.health.checks import robot_meshes
 from mechsearch_jax.geometry.swept_cloud import mesh_of
 from mechsearch_jax.robot import gripper as module
 from mechsearch_jax.robot import kinematics
@@ -21,11 +19,7 @@ GRIPPER = Gripper()
 Q7 = float(np.pi / 4)
 # z of the finger tips' ends in the gripper frame [m].
 TIP = 0.009
-MESHES = next(
-    pathlib.Path(sys.prefix).glob("lib/python*/site-packages/cmeel.prefix/share/example-robot-data/robots"),
-    pathlib.Path("absent"),
-)
-COLLISION = MESHES / "panda_description" / "meshes" / "collision"
+COLLISION = robot_meshes()
 BOUNDED = {"hand": HAND, "finger": FINGER, "link6": LINKS[5], "link7": LINKS[6]}
 
 
@@ -61,7 +55,7 @@ def surface(primitives: tuple[Primitive, ...]) -> np.ndarray:
     return points[union_distance(primitives, points) > -3e-4]
 
 
-@pytest.mark.skipif(not COLLISION.is_dir(), reason="the robot's meshes are not installed: pip install '.[meshes]'")
+@pytest.mark.skipif(COLLISION is None, reason="the robot's meshes are not installed: pip install '.[meshes]'")
 @pytest.mark.parametrize("body", sorted(BOUNDED))
 def test_the_real_surface_lies_inside_the_primitives_and_at_most_8_mm_beneath(body):
     mesh = trimesh.load(COLLISION / f"{body}.stl", force="mesh")
@@ -70,7 +64,7 @@ def test_the_real_surface_lies_inside_the_primitives_and_at_most_8_mm_beneath(bo
     assert cKDTree(surface(BOUNDED[body])).query(points)[0].max() <= 0.008
 
 
-@pytest.mark.skipif(not COLLISION.is_dir(), reason="the robot's meshes are not installed: pip install '.[meshes]'")
+@pytest.mark.skipif(COLLISION is None, reason="the robot's meshes are not installed: pip install '.[meshes]'")
 @pytest.mark.parametrize("link", range(1, 6))
 def test_the_arm_lies_inside_its_capsules(link):
     mesh = trimesh.load(COLLISION / f"link{link}.stl", force="mesh")

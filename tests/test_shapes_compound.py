@@ -15,6 +15,8 @@ from mechsearch_jax.shapes import compound as compounds
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
 from mechsearch_jax.shapes.meshes import convex_pieces, thinned
 from mechsearch_jax.shapes.parts import PARTS, parts_of, volume_in_common
+from mechsearch_jax.shapes.surfaces import deviation
+from mechsearch_jax.shapes.surfaces.mending import mended
 
 HALF = {
     "box": (0.03, 0.02, 0.05),
@@ -213,7 +215,7 @@ def test_what_no_mesh_is_is_one_line(tmp_path, monkeypatch):
     for name, reason in (
         ("none.obj", "cannot be read"),
         ("text.obj", "no triangles"),
-        ("flat.stl", "coacd|flat|convex"),
+        ("flat.stl", "flat parts alone"),
         ("ring.stl", r"install CoACD with: pip install 'mechsearch-jax\[objects\]'"),
     ):
         with pytest.raises(InputError, match=reason) as error:
@@ -260,19 +262,130 @@ def test_vertices_that_a_file_has_several_times_do_not_open_a_surface(tmp_path):
         assert len(convex_pieces(tmp_path / "seams.obj", 1.0, "here")) == 1
 
 
-def test_what_is_not_closed_or_too_thin_is_used_and_said_in_one_line(tmp_path):
+BOX = trimesh.creation.box((0.06, 0.06, 0.25))
+# From a bottle's profile.
+BOTTLE = trimesh.creation.revolve(
+    np.array([(0, 0), (0.03, 0), (0.03, 0.15), (0.012, 0.19), (0.012, 0.25), (0, 0.25)]), sections=48
+)
+
+
+def turned(mesh, which=slice(None)):
+    faces = np.array(mesh.faces)
+    faces[which] = faces[which][:, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def with_seams(mesh):
+    corners = mesh.triangles.reshape(-1, 3) + np.random.default_rng(0).uniform(-2e-6, 2e-6, (3 * len(mesh.faces), 3))
+    return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+
+
+def without(mesh, above):
+    kept = mesh.triangles_center[:, 2] < above
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[kept], process=False)
+
+
+def beside(mesh, *sizes):
+    """A mesh with loose boxes of these sides far from it."""
+    places = ((0.1 * i, 0.2, 0) for i in range(len(sizes)))
+    loose = [trimesh.creation.box((size,) * 3).apply_translation(at) for size, at in zip(sizes, places, strict=True)]
+    return trimesh.util.concatenate([mesh, *loose])
+
+
+def taken(tmp_path, mesh):
+    """Extents [mm] and volume [cm3] of the pieces of a mesh, and what is said of it."""
+    mesh.export(tmp_path / "thing.ply")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", Note)
+        pieces = convex_pieces(tmp_path / "thing.ply", 1.0, "here")
+    extents = 1e3 * np.ptp(np.concatenate([piece.in_body(np.array(piece.vertices)) for piece in pieces]), axis=0)
+    assert all("\n" not in str(note.message) for note in said)
+    return extents, 1e6 * sum(float(compounds.hull(p).volume) for p in pieces), [str(note.message) for note in said]
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [BOX, turned(BOX), turned(BOX, slice(None, None, 2)), with_seams(BOX), BOTTLE, turned(BOTTLE), with_seams(BOTTLE)],
+)
+def test_a_closed_mesh_keeps_its_size_however_its_faces_are_turned_or_joined(tmp_path, mesh):
+    if len(mesh.faces) > 12:
+        pytest.importorskip("coacd")
+    extents, volume, said = taken(tmp_path, mesh)
+    np.testing.assert_allclose(extents, (60, 60, 250), atol=0.1)
+    assert volume == pytest.approx(900 if len(mesh.faces) == 12 else 1e6 * BOTTLE.volume, rel=0.02)
+    assert said == []
+
+
+def test_holes_are_filled_and_said(tmp_path):
     pytest.importorskip("coacd")
-    box = trimesh.creation.box((0.04, 0.06, 0.08))
-    box.update_faces(np.arange(len(box.faces)) > 1)
-    box.export(tmp_path / "open.stl")
-    trimesh.creation.box((0.05, 0.0004, 0.06)).export(tmp_path / "sheet.stl")
-    for name, said in (("open.stl", r"not closed \(4 open edges\)"), ("sheet.stl", r"thinner than 2 mm .*0\.4 mm")):
-        with pytest.warns(Note, match=said) as notes:
-            pieces = convex_pieces(tmp_path / name, 1.0, "here")
-        assert all("\n" not in str(note.message) for note in notes)
-        assert min(meshes.thickness(piece)[0] for piece in pieces) > 0.0019
-    (sheet,) = pieces
-    np.testing.assert_allclose(np.ptp(np.array(sheet.vertices), axis=0), (0.05, 0.002, 0.06), atol=1e-6)
+    flat_top = trimesh.creation.annulus(0.02, 0.03, 0.25)
+    for mesh, volume, hole in ((without(BOX, 0.1249), 900, 60), (without(BOTTLE, 0.2499), 500, 24)):
+        extents, taken_volume, (note,) = taken(tmp_path, mesh)
+        np.testing.assert_allclose(extents, (60, 60, 250), atol=0.1)
+        assert taken_volume == pytest.approx(volume, rel=0.02)
+        assert f"not closed: holes (1, at most {hole} mm wide) are filled, and it is taken as solid" in note
+    # A hole with a rim around another.
+    assert mended(without(flat_top, 0.12)).open_edges == 0
+
+
+def test_what_cannot_be_filled_is_said_to_be_hollow(tmp_path):
+    pytest.importorskip("coacd")
+    # A band with half a twist has no inside.
+    turn = np.linspace(0, 2 * np.pi, 33)[:-1]
+    across = np.stack([np.cos(turn / 2) * np.cos(turn), np.cos(turn / 2) * np.sin(turn), np.sin(turn / 2)], axis=1)
+    middle = 0.05 * np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
+    i = np.arange(32)
+    a, b, c, d = i, i + 32, np.where(i < 31, i + 1, 32), np.where(i < 31, i + 33, 0)
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+    band = trimesh.Trimesh(np.concatenate([middle - 0.02 * across, middle + 0.02 * across]), faces, process=False)
+    extents, _, said = taken(tmp_path, band)
+    assert "cannot be filled: it is taken as a hollow shell" in said[0]
+    np.testing.assert_allclose(extents, 1e3 * band.extents, atol=2.0)
+
+
+def test_specks_flat_parts_and_what_is_inside_are_left_out_and_said(tmp_path):
+    sheet = trimesh.Trimesh([(0.1, 0, 0), (0.12, 0, 0), (0.1, 0.02, 0)], [(0, 1, 2)])
+    inner = trimesh.creation.box((0.05, 0.05, 0.24))
+    mesh = trimesh.util.concatenate([beside(BOX, 0.001, 0.001, 0.002), sheet, turned(inner)])
+    extents, volume, (left_out, inside) = taken(tmp_path, mesh)
+    np.testing.assert_allclose(extents, (60, 60, 250), atol=0.1)
+    assert volume == pytest.approx(900)
+    assert "4 of its 6 loose parts, at most 20 mm long, are left out" in left_out
+    assert "closed surfaces inside it (1, 600 cm3) are left out: it is taken as solid" in inside
+    # What is not tiny stays.
+    assert len(mended(beside(BOX, 0.01, 0.02)).parts) == 3
+
+
+def test_pieces_that_are_off_the_surface_are_said_with_the_figure(tmp_path):
+    pytest.importorskip("coacd")
+    extents, _, (note,) = taken(tmp_path, trimesh.creation.annulus(0.03, 0.04, 0.05, sections=64))
+    np.testing.assert_allclose(extents, (80, 80, 50), atol=0.1)
+    # Eight chords of the hole.
+    out = float(note.split("reach up to ")[1].split()[0])
+    assert 30 * (1 - np.cos(np.pi / 8)) - 0.5 < out < 8.0
+    _, _, (note,) = taken(tmp_path, trimesh.creation.icosphere(subdivisions=3, radius=0.04))
+    assert "reach up to 0.0 mm out of its surface" in note
+    # Cut together: many parts, in which the cutter's remeshing is undone.
+    row = [trimesh.creation.box((0.03, 0.02, 0.02)).apply_translation((0.02 * i, 0, 0.002 * i)) for i in range(17)]
+    mesh = trimesh.util.concatenate(row)
+    np.testing.assert_allclose(taken(tmp_path, mesh)[0], 1e3 * mesh.extents, atol=1.0)
+
+
+def test_the_distance_outside_is_that_to_the_surface():
+    points = np.array([(0.0, 0, 0), (0.03, 0, 0), (0.035, 0, 0), (0.05, 0.04, 0.0), (0, 0, 0.2)])
+    assert deviation.farthest_outside(BOX, points[:2], 1e-3) == 0
+    for count, distance in ((3, 0.005), (4, np.hypot(0.02, 0.01)), (5, 0.075)):
+        assert deviation.farthest_outside(BOX, points[:count], 1e-3) == pytest.approx(distance)
+    np.testing.assert_allclose(deviation.turns_around(BOX, points), (1, 0.5, 0, 0, 0), atol=1e-9)
+    aside = np.array((0.1, 0, 0))
+    hulls = [BOX.vertices, BOX.vertices + aside]
+    np.testing.assert_allclose(deviation.beyond(hulls, points + 0.15 * aside), (0, 0.015, 0.02, 0.01, 0.075), atol=1e-9)
+
+
+def test_pieces_that_are_too_thin_are_used_and_said_in_one_line(tmp_path):
+    extents, _, (note,) = taken(tmp_path, trimesh.creation.box((0.05, 0.0004, 0.06)))
+    assert "thinner than 2 mm (the thinnest 0.4 mm)" in note
+    np.testing.assert_allclose(extents, (50, 2, 60), atol=1e-3)
 
 
 def test_few_corners_are_left_of_many():
@@ -280,6 +393,7 @@ def test_few_corners_are_left_of_many():
     few = thinned(ball)
     assert len(few) <= compounds.MOST_VERTICES
     assert trimesh.convex.convex_hull(few).volume > 0.8 * 4 / 3 * np.pi
+    np.testing.assert_allclose(np.ptp(few, axis=0), np.ptp(ball, axis=0))
     np.testing.assert_array_equal(thinned(ball[:20]), ball[:20])
 
 

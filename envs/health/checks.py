@@ -193,9 +193,22 @@ def _cache() -> Iterator[Finding]:
         yield Finding("cache", State.FINE, says)
 
 
+def robot_meshes() -> Path | None:
+    """The folder of the Panda's collision meshes in an installed `example-robot-data`; None if there is none.
+
+    It is looked for by path: since its version 4.4 the package holds data alone, no Python module.
+    """
+    # Wheels have a prefix of their own beside the modules (cmeel); conda and system packages use the environment's.
+    for prefix in (*(Path(place, "cmeel.prefix") for place in sys.path), Path(sys.prefix)):
+        folder = prefix / "share/example-robot-data/robots/panda_description/meshes/collision"
+        if folder.is_dir():
+            return folder
+    return None
+
+
 def _meshes() -> Iterator[Finding]:
-    if importlib.util.find_spec("example_robot_data") is not None:
-        yield Finding("meshes", State.FINE, "the robot's meshes are installed")
+    if folder := robot_meshes():
+        yield Finding("meshes", State.FINE, f"the robot's meshes are installed: {folder}")
     else:
         says = "the robot's meshes are not installed; only the test of the collision primitives needs them"
         yield Finding("meshes", State.MISSING, says, "pip install 'mechsearch-jax[meshes]'")

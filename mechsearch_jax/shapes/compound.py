@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.shapes import frustum
@@ -29,6 +29,8 @@ COMPOUND, CONVEX = "compound", "convex"
 CONVEX_CODE = len(PRIMITIVES)
 # Most solids of a body once frustums are stacks of discs; most vertices of a convex polyhedron.
 MOST_SOLIDS, MOST_VERTICES = 16, 48
+# Least volume of a convex polyhedron [m3].
+LEAST_VOLUME = 1e-9
 # A centre of mass that is as near as this to the origin is taken for it [m].
 CENTRED = 1e-6
 # Digits to which poses and vertices are rounded when a body is centred [m].
@@ -123,6 +125,14 @@ def hull(piece: Piece) -> trimesh.Trimesh:
     import trimesh
 
     return trimesh.convex.convex_hull(np.array(piece.vertices))
+
+
+def hull_volume(points: Float[np.ndarray, "n 3"]) -> float:
+    """Volume of the convex hull of points [m3]; 0 where they are in a plane."""
+    try:
+        return float(ConvexHull(points).volume)
+    except (QhullError, ValueError):
+        return 0.0
 
 
 def mesh(piece: Piece) -> trimesh.Trimesh:

@@ -8,27 +8,45 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
-from mechsearch_jax.shapes.compound import CONVEX, DIGITS, MOST_SOLIDS, MOST_VERTICES, Piece, faces, hull
+from mechsearch_jax.shapes.compound import (
+    CONVEX,
+    DIGITS,
+    LEAST_VOLUME,
+    MOST_SOLIDS,
+    MOST_VERTICES,
+    Piece,
+    faces,
+    hull,
+    hull_volume,
+)
+from mechsearch_jax.shapes.surfaces.deviation import beyond, deviation, nearest, turns_around
+from mechsearch_jax.shapes.surfaces.mending import SEAM, SPECK, Mended, mended, whole
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 # Largest mesh file [bytes].
 LARGEST_FILE = 1 << 26
 # Concavity up to which a mesh counts as convex, in CoACD's measure, and the most pieces that it is cut into.
 CONCAVITY, PIECES = 0.05, 8
+# A part gets at least so many of a body's solids; where there are too many parts for that, they are cut as one.
+LEAST_SHARE = 4
 # Settings of CoACD beside these: coarser than its own, which take ten times as long and follow a scanned surface no
-# better with so few pieces.
+# better with so few pieces. It remeshes what is no manifold alone, for that makes things larger.
 CUT: Mapping[str, Any] = MappingProxyType(
     {
-        "preprocess_mode": "on",
+        "preprocess_mode": "auto",
         "preprocess_resolution": 20,
         "resolution": 300,
         "mcts_iterations": 20,
@@ -36,6 +54,12 @@ CUT: Mapping[str, Any] = MappingProxyType(
         "mcts_nodes": 10,
     }
 )
+# Evenly spread directions in which the first vertices are looked for where there are too many.
+START = 12
+# Pieces that are farther from the surface than this are said [m].
+FAR = 1e-3
+# What was remeshed reaches out of the mesh by more than this [m]; what was not, by rounding alone.
+REMESHED = 1e-5
 # Thinner walls slip through the simulators' contacts, and through the grid on which grasps are looked for [m].
 LEAST_THICKNESS = 0.002
 # A part of a mesh whose volume is at least this share of its hull's is convex.
@@ -49,35 +73,58 @@ def _read(path: Path, content: str, scale: float, where: str) -> tuple[Piece, ..
     loaded.apply_scale(scale)
     if not np.isfinite(loaded.vertices).all():
         raise InputError(f"{where}: {path} holds vertices that are not finite numbers; mend the mesh")
-    parts = loaded.split(only_watertight=False, repair=False)
-    if 0 < len(parts) <= MOST_SOLIDS and all(_is_convex(part) for part in parts):
-        hulls = [np.asarray(part.vertices) for part in parts]
+    surface = mended(loaded)
+    if not surface.parts:
+        raise InputError(f"{where}: {path} holds flat parts alone; give a mesh of solid ones")
+    if len(surface.parts) <= MOST_SOLIDS and all(_is_convex(part) for part in surface.parts):
+        hulls = [np.asarray(part.vertices) for part in surface.parts]
     else:
-        key = repr((content, scale, sorted(CUT.items()), CONCAVITY, PIECES, MOST_VERTICES, _versions()))
-        rows = kept_arrays("mesh", key, lambda: _decomposed(loaded, path, where))
+        key = repr((content, scale, sorted(CUT.items()), CONCAVITY, PIECES, MOST_VERTICES, SEAM, SPECK, _versions()))
+        rows = kept_arrays("mesh", key, lambda: _decomposed(surface.parts, path, where))
         hulls = [rows[name] for name in sorted(rows)]
-    uses = np.unique(loaded.edges_sorted, axis=0, return_counts=True)[1]
     pieces = [_piece(vertices, path, where) for vertices in hulls]
-    _note_what_was_mended(path, int((uses == 1).sum()), pieces)
+    for note in _what_was_mended(surface, pieces):
+        warnings.warn(f"{path}: {note}", Note, stacklevel=2)
     return tuple(_thickened(piece) for piece in pieces)
 
 
-def _note_what_was_mended(path: Path, open_edges: int, pieces: Sequence[Piece]) -> None:
-    if open_edges:
-        volume = 1e6 * sum(float(hull(piece).volume) for piece in pieces)
-        warnings.warn(
-            f"{path}: its surface is not closed ({open_edges} open edges), so that what is inside is a guess; it is"
-            f" taken as {len(pieces)} convex pieces of {volume:.0f} cm3 together; close it if pictures show them wrong",
-            Note,
-            stacklevel=2,
+def _what_was_mended(surface: Mended, pieces: Sequence[Piece]) -> Iterator[str]:
+    """One line about each thing of a mesh that is used, perhaps not as it was meant."""
+    volume = 1e6 * sum(float(hull(piece).volume) for piece in pieces)
+    taken = f"{len(pieces)} convex pieces of {volume:.0f} cm3 together"
+    if surface.specks:
+        yield (
+            f"{len(surface.specks)} of its {len(surface.specks) + len(surface.inner) + len(surface.parts)} loose parts,"
+            f" at most {1e3 * max(surface.specks):.2g} mm long, are left out, tiny or flat; if they belong to it, join"
+            " them to the rest"
+        )
+    if surface.inner:
+        yield (
+            f"closed surfaces inside it ({len(surface.inner)}, {1e6 * sum(surface.inner):.0f} cm3) are left out: it is"
+            f" taken as solid, {taken}; if it is hollow, give a smaller density"
+        )
+    if surface.holes:
+        yield (
+            f"its surface is not closed: holes ({len(surface.holes)}, at most {1e3 * max(surface.holes):.0f} mm wide)"
+            f" are filled, and it is taken as solid, {taken}; if it is hollow, give its wall a thickness"
+        )
+    if surface.open_edges:
+        yield (
+            f"its surface is not closed ({surface.open_edges} open edges), and its holes cannot be filled: it is taken"
+            f" as a hollow shell, {taken}; close it if it is solid"
+        )
+    hulls = [piece.in_body(np.array(piece.vertices)) for piece in pieces]
+    out, within = deviation(whole(surface.parts), hulls, FAR)
+    if max(out, within) > FAR:
+        yield (
+            f"its convex pieces reach up to {1e3 * out:.1f} mm out of its surface, as where they fill hollows, and stay"
+            f" up to {1e3 * within:.1f} mm inside it; where that matters, give it as at most {MOST_SOLIDS} convex parts"
         )
     thin = [width for piece in pieces if (width := thickness(piece)[0]) < LEAST_THICKNESS]
     if thin:
-        warnings.warn(
-            f"{path}: {len(thin)} of its convex pieces are thinner than {1e3 * LEAST_THICKNESS:g} mm (the thinnest"
-            f" {1e3 * min(thin):.2g} mm) and are made so thick; if that is not meant, scale is that of another unit",
-            Note,
-            stacklevel=2,
+        yield (
+            f"{len(thin)} of its convex pieces are thinner than {1e3 * LEAST_THICKNESS:g} mm (the thinnest"
+            f" {1e3 * min(thin):.2g} mm) and are made so thick; if that is not meant, scale is that of another unit"
         )
 
 
@@ -130,8 +177,8 @@ def _is_convex(part) -> bool:
     return bool(part.is_watertight and part.volume >= CONVEX_SHARE * part.convex_hull.volume)
 
 
-def _decomposed(mesh, path: Path, where: str) -> dict[str, Float[np.ndarray, "n 3"]]:
-    """Vertices of convex pieces that together are about a mesh, by names in their order."""
+def _decomposed(parts: Sequence[Trimesh], path: Path, where: str) -> dict[str, Float[np.ndarray, "n 3"]]:
+    """Vertices of convex pieces that together are about a mesh of several parts, by names in their order."""
     try:
         import coacd  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -140,21 +187,47 @@ def _decomposed(mesh, path: Path, where: str) -> dict[str, Float[np.ndarray, "n 
             " pip install 'mechsearch-jax[objects]'"
         ) from None
     coacd.set_log_level("error")
-    settings = {"max_convex_hull": PIECES, "decimate": True, "max_ch_vertex": MOST_VERTICES, "seed": 0, **CUT}
-    whole = coacd.Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    pieces = coacd.run_coacd(whole, threshold=CONCAVITY, **settings)
-    return {f"piece{i:02}": np.asarray(vertices) for i, (vertices, _) in enumerate(pieces)}
+    bent = sum(not _is_convex(part) for part in parts)
+    share = (MOST_SOLIDS - len(parts) + bent) // max(bent, 1)
+    if share < LEAST_SHARE:
+        parts, share = [whole(parts)], PIECES
+    hulls = []
+    for part in parts:
+        if _is_convex(part):
+            hulls.append(np.asarray(part.vertices))
+            continue
+        cut = coacd.run_coacd(
+            coacd.Mesh(np.asarray(part.vertices), np.asarray(part.faces)),
+            threshold=CONCAVITY,
+            max_convex_hull=min(share, PIECES),
+            seed=0,
+            **CUT,
+        )
+        found = [_true_to_size(thinned(_corners(vertices)), part) for vertices, _ in cut if hull_volume(vertices)]
+        # Slivers along the cuts.
+        hulls += [vertices for vertices in found if hull_volume(vertices) >= LEAST_VOLUME] or found
+    return {f"piece{i:02}": vertices for i, vertices in enumerate(hulls)}
+
+
+def _true_to_size(corners: Float[np.ndarray, "n 3"], part: Trimesh) -> Float[np.ndarray, "n 3"]:
+    """Corners of a piece of a part, without what remeshing has added: those outside are moved to the surface."""
+    low, high = part.bounds
+    if np.max([low - corners.min(axis=0), corners.max(axis=0) - high]) <= REMESHED:
+        return corners
+    moved = np.where(turns_around(part, corners)[:, None] < 0.5, nearest(part, corners)[0], corners)
+    return _corners(moved) if hull_volume(moved) else corners
+
+
+def _corners(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Those of the convex hull."""
+    return vertices[ConvexHull(vertices).vertices]
 
 
 def _piece(vertices: Float[np.ndarray, "n 3"], path: Path, where: str) -> Piece:
     """The convex hull of vertices, thinned to `MOST_VERTICES`, about its own centre."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        corners = vertices[ConvexHull(vertices).vertices]
-    except (QhullError, ValueError):
-        raise InputError(f"{where}: {path} has a part that is flat; give a mesh of solid parts") from None
-    corners = thinned(corners)
+    if not hull_volume(vertices):
+        raise InputError(f"{where}: {path} has a part that is flat; give a mesh of solid parts")
+    corners = thinned(_corners(vertices))
     centre = np.round(corners.mean(axis=0), DIGITS)
     rows = np.round(corners - centre, DIGITS)
     x, y, z = centre.tolist()
@@ -162,22 +235,30 @@ def _piece(vertices: Float[np.ndarray, "n 3"], path: Path, where: str) -> Piece:
 
 
 def thinned(corners: Float[np.ndarray, "n 3"], most: int = MOST_VERTICES) -> Float[np.ndarray, "m 3"]:
-    """At most so many of the vertices of a convex polyhedron: those farthest out in evenly spread directions."""
+    """At most so many of the vertices of a convex polyhedron: those farthest out along the axes, so that it stays as
+    long, wide and tall, and in `START` other directions, then always the one that is farthest from the hull of those.
+    """
     if len(corners) <= most:
         return corners
-    rows = np.arange(most) + 0.5
-    angle, height = np.pi * (1 + 5**0.5) * rows, 1 - 2 * rows / most
+    rows = np.arange(START) + 0.5
+    angle, height = np.pi * (1 + 5**0.5) * rows, 1 - 2 * rows / START
     level = np.sqrt(1 - height**2)
-    directions = np.stack([level * np.cos(angle), level * np.sin(angle), height], axis=1)
-    return corners[np.unique(np.argmax(corners @ directions.T, axis=0))]
+    around = np.stack([level * np.cos(angle), level * np.sin(angle), height], axis=1)
+    kept = np.unique(np.argmax(corners @ np.concatenate([np.eye(3), -np.eye(3), around]).T, axis=0))
+    while len(kept) < most and (away := beyond([corners[kept]], corners)).max() > 0:
+        kept = np.union1d(kept, np.argmax(away))
+    return corners[kept]
 
 
 def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
     """The convex pieces of a mesh file, in the mesh's frame.
 
-    A mesh of at most 16 connected parts that are convex is taken as it is. Any other is cut into at most `PIECES`
-    pieces, always the same, which are kept on disk, see `runtime.kept_arrays`. A `Note` warns where the surface is not
-    closed, and where pieces are thinner than `LEAST_THICKNESS` and are made so thick.
+    Seams are welded, faces turned outwards, holes filled; loose parts that are tiny or flat, and closed ones inside
+    others, are left out, see `surfaces.mending`. A mesh of at most 16 connected parts that are convex then is taken as
+    it is. Of any other, each part is cut into at most `PIECES` pieces, all together where there would be too many;
+    always the same, which are kept on disk, see `runtime.kept_arrays`. A `Note` warns of all that was filled or left
+    out, where pieces are more than 1 mm off the surface, and where they are thinner than `LEAST_THICKNESS` and are made
+    so thick.
 
     Args:
       path: of the file.

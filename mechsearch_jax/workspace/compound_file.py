@@ -7,11 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.shapes import PRIMITIVES, frustum
-from mechsearch_jax.shapes.compound import CONVEX, IDENTITY, MOST_SOLIDS, MOST_VERTICES, Compound, Piece, solids
+from mechsearch_jax.shapes.compound import (
+    CONVEX,
+    IDENTITY,
+    LEAST_VOLUME,
+    MOST_SOLIDS,
+    MOST_VERTICES,
+    Compound,
+    Piece,
+    hull_volume,
+    solids,
+)
 from mechsearch_jax.shapes.meshes import convex_pieces
 from mechsearch_jax.workspace.json_checks import check_keys, check_norm, number, numbers
 
@@ -20,8 +29,6 @@ LEAST, LARGEST = 1e-3, 0.5
 DENSITIES = (1.0, 25_000.0)
 FRICTIONS = (0.0, 5.0)
 SCALES = (1e-6, 1e3)
-# Least volume of a convex polyhedron [m3].
-LEAST_VOLUME = 1e-9
 _SHAPES = (*PRIMITIVES, frustum.NAME, CONVEX)
 _SHARED = ("density", "friction")
 
@@ -61,6 +68,13 @@ def _mesh_pieces(value: dict[str, Any], where: str, folder: Path) -> tuple[Piece
         raise InputError(f"{where}.mesh: {shown(value['mesh'])} must be the path of a mesh file")
     scale = number(value.get("scale", 1.0), *SCALES, "metres per unit of the mesh", f"{where}.scale")
     pieces = convex_pieces(folder / value["mesh"], scale, f"{where}.mesh")
+    volumes = [hull_volume(np.array(piece.vertices)) for piece in pieces]
+    small = sum(volume < LEAST_VOLUME for volume in volumes)
+    if 0 < small < len(pieces):
+        raise InputError(
+            f"{where}.mesh: {small} of its {len(pieces)} loose parts have less than {LEAST_VOLUME * 1e9:g} mm3, the"
+            f" largest {max(volumes) * 1e6:.3g} cm3; delete the small ones from the mesh"
+        )
     for piece in pieces:
         _check_polyhedron(np.array(piece.vertices), f"{where}.mesh", "give its unit as scale, such as 0.001")
     return pieces
@@ -120,11 +134,7 @@ def _check_polyhedron(vertices: np.ndarray, where: str, remedy: str) -> None:
     extent = float(np.ptp(vertices, axis=0).max())
     if extent > 2 * LARGEST:
         raise InputError(f"{where}: a piece is {extent:.3g} m long, more than {2 * LARGEST}; {remedy}")
-    try:
-        volume = float(ConvexHull(vertices).volume)
-    except QhullError:
-        volume = 0.0
-    if volume < LEAST_VOLUME:
+    if hull_volume(vertices) < LEAST_VOLUME:
         raise InputError(f"{where}: a piece is flat, or has less than {LEAST_VOLUME * 1e9:g} mm3; {remedy}")
 
 

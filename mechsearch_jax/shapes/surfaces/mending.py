@@ -1,0 +1,172 @@
+"""Surfaces of mesh files made ready to be cut: seams welded, holes closed, faces turned outwards, specks left out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mechsearch_jax.shapes.compound import hull_volume
+from mechsearch_jax.shapes.surfaces.deviation import turns_around
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+# Vertices of open edges that are as near to each other are one [m].
+SEAM = 2e-5
+# A connected part is a speck if its longest side is at most this share of that of the largest part.
+SPECK = 0.03
+# A closed surface encloses more than this share of the volume of the box around it.
+FLAT = 1e-3
+# So many vertices of a part are looked at to tell whether it lies inside another.
+LOOKED_AT = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class Mended:
+    """A mesh's connected parts, none within another.
+
+    Attributes:
+      parts: each has consistent winding where it can be oriented, and faces outwards.
+      holes: widths of those that were closed [m].
+      open_edges: how many are left.
+      specks: longest sides of the parts that were left out: flat, or tiny beside the largest [m].
+      inner: volumes of the closed parts that were left out because they lie inside another [m3].
+    """
+
+    parts: tuple[Trimesh, ...]
+    holes: tuple[float, ...]
+    open_edges: int
+    specks: tuple[float, ...]
+    inner: tuple[float, ...]
+
+
+def mended(mesh: Trimesh) -> Mended:
+    """What a mesh in metres, whose vertices at the same place are one, is taken for."""
+    mesh = _wound(_welded(mesh))
+    parts = list(mesh.split(only_watertight=False, repair=False))
+    longest = [float(np.max(part.extents)) for part in parts]
+    least = SPECK * max(longest, default=0.0)
+    kept, specks, holes = [], [], []
+    for part, size in zip(parts, longest, strict=True):
+        if size <= least or hull_volume(np.asarray(part.vertices)) == 0:
+            specks.append(size)
+        else:
+            closed, widths = _closed(part)
+            kept.append(_outwards(closed))
+            holes += widths
+    outer, inner = _outermost(kept)
+    left = sum(len(open_edges(part)) for part in outer)
+    return Mended(tuple(outer), tuple(holes), left, tuple(specks), tuple(inner))
+
+
+def whole(parts: Sequence[Trimesh]) -> Trimesh:
+    """Several surfaces as one."""
+    import trimesh
+
+    return trimesh.util.concatenate(list(parts))
+
+
+def open_edges(mesh: Trimesh) -> Int[np.ndarray, "n 2"]:
+    """The edges that only one triangle has, in its direction."""
+    edges = np.asarray(mesh.edges_sorted)
+    _, first, uses = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    return np.asarray(mesh.edges)[first[uses == 1]]
+
+
+def _welded(mesh: Trimesh) -> Trimesh:
+    """The mesh without seams: other vertices than those of open edges stay, however near to each other."""
+    border = np.unique(open_edges(mesh))
+    if len(border):
+        pairs = border[cKDTree(mesh.vertices[border]).query_pairs(SEAM, output_type="ndarray")]
+        same = _components(pairs, len(mesh.vertices))
+        # The first vertex of each group stands for it.
+        first = np.unique(same, return_index=True)[1]
+        mesh = type(mesh)(mesh.vertices, first[same][mesh.faces], process=False)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _components(pairs: Int[np.ndarray, "n 2"], count: int) -> Int[np.ndarray, " count"]:
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _wound(mesh: Trimesh) -> Trimesh:
+    """The mesh with faces that share an edge running through it in opposite directions, wherever that is possible."""
+    pairs, shared, count = np.asarray(mesh.face_adjacency), np.asarray(mesh.face_adjacency_edges), len(mesh.faces)
+    if not len(pairs):
+        return mesh
+    along = [_runs_along(np.asarray(mesh.faces)[pairs[:, side]], shared) for side in (0, 1)]
+    clash = along[0] == along[1]
+    # Every face twice, as it is and turned: what fits together is connected. Where both are, there is no orientation.
+    a, b = pairs.T
+    fits = np.concatenate([np.stack([a, b + count * clash], 1), np.stack([a + count, b + count * ~clash], 1)])
+    group = _components(fits, 2 * count)
+    turned = group[:count] > group[count:]
+    return type(mesh)(mesh.vertices, np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces), process=False)
+
+
+def _runs_along(faces: Int[np.ndarray, "n 3"], edges: Int[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Whether faces have one of their edges in its direction."""
+    after = np.roll(faces, -1, axis=1)
+    return np.any((faces == edges[:, :1]) & (after == edges[:, 1:]), axis=1)
+
+
+def _closed(part: Trimesh) -> tuple[Trimesh, list[float]]:
+    """A connected part with a lid on every hole, and the holes' widths [m]; as it is where lids do not close it.
+
+    A lid joins the edges around a hole to their centre. Of a flat hole it lies in the hole's plane, of whatever outline
+    the hole is, and where it overlaps itself, it does so with opposite signs.
+    """
+    border = open_edges(part)
+    if not len(border):
+        return part, []
+    begins, ends = (np.bincount(border[:, side], minlength=len(part.vertices)) for side in (0, 1))
+    if not np.array_equal(begins, ends):
+        return part, []
+    hole = np.unique(_components(border, len(part.vertices))[border[:, 0]], return_inverse=True)[1]
+    vertices, widths = np.asarray(part.vertices), []
+    centres = np.empty((hole.max() + 1, 3))
+    for i in range(len(centres)):
+        around = vertices[border[hole == i]]
+        centres[i] = around.mean(axis=(0, 1))
+        widths.append(float(np.ptp(around.reshape(-1, 3), axis=0).max()))
+    lids = np.column_stack([border[:, ::-1], len(vertices) + hole])
+    closed = type(part)(np.concatenate([vertices, centres]), np.concatenate([part.faces, lids]), process=False)
+    closed.update_faces(closed.nondegenerate_faces())
+    encloses = abs(closed.volume) > FLAT * np.prod(closed.extents)
+    return (closed, widths) if encloses and closed.is_watertight else (part, [])
+
+
+def _outwards(part: Trimesh) -> Trimesh:
+    """The part with its faces turned away from its middle on the whole; of a closed one, outwards."""
+    away = part.triangles_center - part.vertices.mean(axis=0)
+    if np.sum(away * part.triangles_cross) < 0:
+        part.invert()
+    return part
+
+
+def _outermost(parts: list[Trimesh]) -> tuple[list[Trimesh], list[float]]:
+    """The parts that are not within another, and the volumes of the others [m3]."""
+    outer, inner = [], []
+    for part in sorted(parts, key=lambda part: -float(np.prod(part.extents))):
+        corners = np.asarray(part.vertices)[:: -(-len(part.vertices) // LOOKED_AT)]
+        if part.is_watertight and any(_within(part, corners, other) for other in outer):
+            inner.append(abs(float(part.volume)))
+        else:
+            outer.append(part)
+    return outer, inner
+
+
+def _within(part: Trimesh, corners: np.ndarray, other: Trimesh) -> bool:
+    low, high = other.bounds
+    around = bool(np.all(part.bounds[0] > low) and np.all(part.bounds[1] < high))
+    return around and other.is_watertight and bool(np.all(turns_around(other, corners) > 0.5))
