@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.world.model import compile_model
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasp_config import GraspConfig
@@ -35,6 +36,8 @@ from mechsearch_jax.workspace.target import Target
 CATALOGUE = ObjectSizes().catalogue
 # By so much the image is reduced in which a compound must not show at all.
 COARSE = 8
+# `impratio` while bodies are dropped: poses to the micrometre, and with them all recorded scenes, depend on it.
+DROPPED_RATIO = 10.0
 # Draws an object, as it stands with its centre above the origin of a board at z 0.
 DrawBody = Callable[[np.random.Generator], Body]
 
@@ -176,7 +179,9 @@ class ScenarioGenerator:
             spawn = getattr(self._shelf, f"spawn_{name}")
             if not (spawn[0] < high and spawn[1] > low):
                 raise InputError(f"Shelf: spawn_{name} {spawn} is beside the board, which reaches from {low} to {high}")
-        self._simulator = NativeWorld(self._shelf, self._camera)
+        blank = compile_model(self._shelf, self._camera)
+        blank.opt.impratio = DROPPED_RATIO
+        self._simulator = NativeWorld(self._shelf, self._camera, blank=blank)
         self._poses = self.target.candidate_poses(self._shelf).astype(float)
         if self.config.anywhere:
             self._graspable = graspable or graspable_at(self._shelf, self.target, gripper)
