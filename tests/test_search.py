@@ -132,7 +132,7 @@ def test_without_an_action_it_says_why(problem):
     step = searcher_of(problem, nothing, policy=idle).next(IMAGES.depth)
     assert step.kind == "none"
     assert "something stands on the shelf, but no object and no target is recognised" in step.reason
-    assert any("started anew" in warning for warning in step.warnings)
+    assert any("open again" in warning for warning in step.warnings)
 
 
 def test_what_does_not_tell_the_target_is_a_warning():

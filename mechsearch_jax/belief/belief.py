@@ -43,7 +43,7 @@ class Belief(flax.struct.PyTreeNode):
       allowed: how many coarse pixels the target may show at each place of its candidate poses while it is hidden, shape
         (X, S); see `existence.allowances`.
       grasps: the grasps of the found target that arm and shelf allow.
-      restarts: how often f became empty and was reset.
+      restarts: how often f became empty, and hidden or unmeasured space was opened again.
     """
 
     exists: jax.Array
