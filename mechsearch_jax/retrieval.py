@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
 from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.actions.unseen_space import PossibleSpace, enters_unmeasured
 from mechsearch_jax.geometry.bodies import enlarged, slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
@@ -263,16 +264,20 @@ def crossing_hits(
 
 @kept()
 def worth_trying(
-    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
+    grasps: TargetGrasps,
+    scene: Superquadrics,
+    pose: Float[Array, "3"],
+    active: Bool[Array, ""] | bool = True,
+    space: PossibleSpace | None = None,
 ) -> GraspChoice:
     """`TRIES` different grasps of a target at a pose for trials, leading axis, best first.
 
     Grasps that hit nothing come first, ranked as in `best_grasp`, then those that hit objects least deep.
 
     Args:
-      grasps, scene, pose, active: as in `best_grasp`.
+      grasps, scene, pose, active, space: as in `best_grasp`.
     """
-    ranked = _ranked(grasps, scene, pose, active, DEPTHS)
+    ranked = _ranked(grasps, scene, pose, active, DEPTHS, space)
     approach, q7 = ranked.T_world_gripper[:, :3, 2], grasps.tables.q7
 
     def pick(order, _):
@@ -287,7 +292,11 @@ def worth_trying(
 
 @kept()
 def best_grasp(
-    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
+    grasps: TargetGrasps,
+    scene: Superquadrics,
+    pose: Float[Array, "3"],
+    active: Bool[Array, ""] | bool = True,
+    space: PossibleSpace | None = None,
 ) -> GraspChoice:
     """Whether and how a target at a pose can be grasped without hitting anything.
 
@@ -296,8 +305,10 @@ def best_grasp(
       scene: the objects, without the target.
       pose: pose of the target as x, y [m], yaw [rad]; need not be a candidate pose.
       active: whether the target is found; if not, no grasp is feasible and little is computed.
+      space: says what was not measured: a grasp that sweeps it ranks as if it hit one more object; None if everything
+        was.
     """
-    ranked = _ranked(grasps, scene, pose, active)
+    ranked = _ranked(grasps, scene, pose, active, space=space)
     # Independent of the ranking: a caller that uses only these does not compute the clearances.
     fewest = jnp.min(ranked.hits)
     choice = _choice(grasps, ranked, jnp.argmin(ranked.order))
@@ -332,11 +343,12 @@ def _ranked(
     pose: Float[Array, "3"],
     active: Bool[Array, ""] | bool,
     depths: tuple[float, ...] = (),
+    space: PossibleSpace | None = None,
 ) -> _Ranked:
     """All grasps, ranked by number of hits, then by clearance.
 
     Args:
-      grasps, scene, pose, active: as in `best_grasp`.
+      grasps, scene, pose, active, space: as in `best_grasp`.
       depths: amounts by which objects are shrunk [m]; hits of the shrunk objects rank before the number of hits.
     """
     T_world_target = grasps.standing(pose)
@@ -354,7 +366,23 @@ def _ranked(
     crowd = jnp.sum(jax.lax.map(near, jnp.float32(CLEARANCES)), axis=0)
     # Infeasible grasps come last, even after those marked as alike.
     order = jnp.where(found.feasible, 1000 * sum(deeper, jnp.zeros_like(hits)) + 100 * hits + crowd, 10 * FAR)
-    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), found.feasible, hits, order)
+    T_world_gripper = compose(T_world_target[None], tables.T_target_gripper)
+    if space is not None:
+        order += 100 * _sweep_unmeasured(tables, T_world_gripper, space, found.feasible)
+    return _Ranked(T_world_gripper, found.feasible, hits, order)
+
+
+def _sweep_unmeasured(
+    tables: GraspTables, T_world_gripper: Float[Array, "f 4 4"], space: PossibleSpace, mask: Bool[Array, " f"]
+) -> Bool[Array, " f"]:
+    """Which grasps sweep, on their straight way, space in which something may stand that has no depth."""
+
+    def enters(_, space, row):
+        T, cloud = row
+        return jnp.any(enters_unmeasured(space, transform(T, cloud.T)))
+
+    anything = jnp.any(jnp.isfinite(space.unmeasured))
+    return masked_vmap(enters, mask & anything, None, space, (T_world_gripper, tables.swept.points), block=64)
 
 
 def _choice(grasps: TargetGrasps, ranked: _Ranked, i: Int[Array, ""]) -> GraspChoice:

@@ -20,7 +20,8 @@ from jaxtyping import Array
 
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.belief.belief import Belief, without_candidates, without_grasps
+from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.belief.belief import Belief, possible_space, without_candidates, without_grasps
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
@@ -174,7 +175,8 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         """
         # Without a traced `found` the call is the same as elsewhere, so that nothing is compiled twice.
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
-        grasp = self.grasps(problem.target_grasps, observation.objects, belief.found_pose, *active)
+        unmeasured = {} if observation.measured is None else {"space": _space(problem, belief)}
+        grasp = self.grasps(problem.target_grasps, observation.objects, belief.found_pose, *active, **unmeasured)
         return _retrieval(self, belief, observation, grasp)
 
     def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
@@ -195,6 +197,11 @@ def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
     if grasp.alternatives is None or planned.alternatives is None:
         return planned
     return planned.replace(alternatives=in_turn(grasp.alternatives, planned.alternatives))
+
+
+@kept()
+def _space(problem: Problem, belief: Belief) -> PossibleSpace:
+    return possible_space(problem, belief, belief.exists)
 
 
 @kept()
