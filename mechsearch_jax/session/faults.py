@@ -86,8 +86,8 @@ def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list
     faults = []
     if int(after.restarts) > int(before.restarts) and not shelf_is_empty:
         faults.append(
-            "f became empty: what is hidden or was not measured is open again; something moved that was not seen, or a shape "
-            "is wrong"
+            "f became empty: what is hidden or was not measured is open again; something moved that was not seen, or a "
+            "shape is wrong"
         )
     if bool(before.found) and not bool(after.found):
         faults.append("the target is not where it was found any more: it is searched for anew")
