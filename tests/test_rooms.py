@@ -1,7 +1,6 @@
 """Imports point one way: from benchmarks and training to the simulated shelf, from that to the planner, never round."""
 
 import ast
-import collections
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -97,27 +96,3 @@ def test_the_planner_knows_neither_simulators_nor_benchmarks():
         inside = file.relative_to(ROOT / "mechsearch_jax").parts
         if inside[0] not in outside:
             assert {other[0] for other in imports(file) if other} <= {"mechsearch_jax"}, file
-
-
-def source():
-    """The files of all packages."""
-    return sorted(file for package in ("mechsearch_jax", *PACKAGES) for file in (ROOT / package).rglob("*.py"))
-
-
-def test_a_folder_holds_no_more_than_a_newcomer_looks_through():
-    held = collections.Counter(file.parent for file in source() if file.name != "__init__.py")
-    assert {folder: count for folder, count in held.items() if count > 15} == {}
-
-
-# Each is one thing: an optimiser, a table of primitives, a class.
-LONG = {
-    "mechsearch_jax/perception/refinement.py",
-    "mechsearch_jax/robot/gripper.py",
-    "mechsearch_jax/session/searcher.py",
-}
-
-
-def test_a_file_is_read_in_one_sitting():
-    lines = {str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines()) for file in source()}
-    assert {name for name, count in lines.items() if count > 400} <= LONG
-    assert lines.keys() >= LONG

@@ -44,8 +44,8 @@ def unmeasured_heights(
     shape = (rows, columns, layers, len(corners))
     points = jnp.stack(
         [
-            jnp.broadcast_to(x[:, None, None, None] + corners[:, 0], shape),
-            jnp.broadcast_to(y[None, :, None, None] + corners[:, 1], shape),
+            jnp.broadcast_to(x[:, None, None, None] + corners[:, 0].reshape(1, 1, 1, -1), shape),
+            jnp.broadcast_to(y[None, :, None, None] + corners[:, 1].reshape(1, 1, 1, -1), shape),
             jnp.broadcast_to(z[None, None, :, None], shape),
         ],
         axis=-1,
