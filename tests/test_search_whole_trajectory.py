@@ -93,7 +93,7 @@ def test_positions_velocities_and_accelerations_are_of_one_curve():
     middle = (trajectory.velocity[1:] + trajectory.velocity[:-1]) / 2
     np.testing.assert_allclose(np.diff(trajectory.position, axis=0) / step, middle, atol=2e-3)
     middle = (trajectory.acceleration[1:] + trajectory.acceleration[:-1]) / 2
-    np.testing.assert_allclose(np.diff(trajectory.velocity, axis=0) / step, middle, atol=1e-2)
+    np.testing.assert_allclose(np.diff(trajectory.velocity, axis=0) / step, middle, atol=5e-2)
 
 
 def test_the_fingers_open_on_the_way_grip_and_hold_on():

@@ -169,7 +169,7 @@ def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float, arm: Arm
     longest = np.array([s.longest for s in stretches])
     points = jnp.stack([_points(q, s, count) for s in stretches])
     curves = jax.vmap(lambda p: smooth_curve(p, arm))(points)
-    seconds, ramp = jax.vmap(lambda *given: timing(*given, arm))(
+    seconds, ramp = jax.vmap(lambda curve, fewest, share: timing(curve, fewest, share, arm))(
         curves, jnp.asarray(least * timestep, jnp.float32), pace
     )
 

@@ -178,14 +178,14 @@ def derivatives(
     Args:
       position: the rows [rad].
       timestep: between them [s].
-      rests: rows at which the arm is at rest, beside the first and the last; velocities are exactly 0 there.
+      rests: rows at which the arm is at rest, beside the first and the last; both are exactly 0 there.
     """
     velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
     for first, last in itertools.pairwise(sorted({0, *rests, len(position) - 1})):
         rows = slice(first, last + 1)
         spline = CubicSpline(np.arange(last + 1 - first) * timestep, position[rows], bc_type="clamped")
         velocity[rows], acceleration[rows] = spline(spline.x, 1), spline(spline.x, 2)
-        velocity[[first, last]] = 0.0
+        velocity[[first, last]] = acceleration[[first, last]] = 0.0
     return velocity, acceleration
 
 
