@@ -13,7 +13,7 @@ from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.shapes import PRIMITIVES, frustum, meshes
 from mechsearch_jax.shapes import compound as compounds
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
-from mechsearch_jax.shapes.meshes import convex_pieces, thinned
+from mechsearch_jax.shapes.meshes import convex_pieces, joined, thinned
 from mechsearch_jax.shapes.parts import PARTS, parts_of, volume_in_common
 from mechsearch_jax.shapes.surfaces import deviation
 from mechsearch_jax.shapes.surfaces.mending import mended
@@ -365,10 +365,17 @@ def test_pieces_that_are_off_the_surface_are_said_with_the_figure(tmp_path):
     assert 30 * (1 - np.cos(np.pi / 8)) - 0.5 < out < 8.0
     _, _, (note,) = taken(tmp_path, trimesh.creation.icosphere(subdivisions=3, radius=0.04))
     assert "reach up to 0.0 mm out of its surface" in note
-    # Cut together: many parts, in which the cutter's remeshing is undone.
-    row = [trimesh.creation.box((0.03, 0.02, 0.02)).apply_translation((0.02 * i, 0, 0.002 * i)) for i in range(17)]
-    mesh = trimesh.util.concatenate(row)
-    np.testing.assert_allclose(taken(tmp_path, mesh)[0], 1e3 * mesh.extents, atol=1.0)
+
+
+def test_of_too_many_parts_neighbours_are_joined(tmp_path):
+    row = [trimesh.creation.box((0.03, 0.02, 0.02)).apply_translation((0.02 * i, 0, 0.001 * i)) for i in range(17)]
+    mesh = trimesh.util.concatenate([*row, trimesh.creation.box((0.02, 0.02, 0.1)).apply_translation((0.1, 0.3, 0))])
+    extents, volume, _ = taken(tmp_path, mesh)
+    np.testing.assert_allclose(extents, 1e3 * mesh.extents, atol=0.1)
+    few = joined([np.array(part.vertices) for part in mesh.split()], 2)
+    far = [len(corners) for corners in few if corners[:, 1].max() > 0.2]
+    assert (len(few), far) == (2, [8])
+    assert volume == pytest.approx(1e6 * mesh.volume, rel=0.02)
 
 
 def test_the_distance_outside_is_that_to_the_surface():
