@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 LARGEST_FILE = 1 << 26
 # Concavity up to which a mesh counts as convex, in CoACD's measure, and the most pieces that it is cut into.
 CONCAVITY, PIECES = 0.05, 8
-# A part gets at least so many of a body's solids; where there are too many parts for that, they are cut as one.
-LEAST_SHARE = 4
 # Settings of CoACD beside these: coarser than its own, which take ten times as long and follow a scanned surface no
 # better with so few pieces. It remeshes what is no manifold alone, for that makes things larger.
 CUT: Mapping[str, Any] = MappingProxyType(
@@ -54,6 +52,8 @@ CUT: Mapping[str, Any] = MappingProxyType(
         "mcts_nodes": 10,
     }
 )
+# Pieces that may be joined with one: those whose centres are nearest.
+NEIGHBOURS = 9
 # Evenly spread directions in which the first vertices are looked for where there are too many.
 START = 12
 # Pieces that are farther from the surface than this are said [m].
@@ -179,6 +179,14 @@ def _is_convex(part) -> bool:
 
 def _decomposed(parts: Sequence[Trimesh], path: Path, where: str) -> dict[str, Float[np.ndarray, "n 3"]]:
     """Vertices of convex pieces that together are about a mesh of several parts, by names in their order."""
+    hulls = []
+    for part in parts:
+        hulls += [np.asarray(part.vertices)] if _is_convex(part) else _cut(part, path, where)
+    return {f"piece{i:02}": vertices for i, vertices in enumerate(joined(hulls))}
+
+
+def _cut(part: Trimesh, path: Path, where: str) -> list[Float[np.ndarray, "n 3"]]:
+    """Vertices of convex pieces that together are about a connected part."""
     try:
         import coacd  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -187,33 +195,44 @@ def _decomposed(parts: Sequence[Trimesh], path: Path, where: str) -> dict[str, F
             " pip install 'mechsearch-jax[objects]'"
         ) from None
     coacd.set_log_level("error")
-    bent = sum(not _is_convex(part) for part in parts)
-    share = (MOST_SOLIDS - len(parts) + bent) // max(bent, 1)
-    if share < LEAST_SHARE:
-        parts, share = [whole(parts)], PIECES
-    hulls = []
-    for part in parts:
-        if _is_convex(part):
-            hulls.append(np.asarray(part.vertices))
-            continue
-        cut = coacd.run_coacd(
-            coacd.Mesh(np.asarray(part.vertices), np.asarray(part.faces)),
-            threshold=CONCAVITY,
-            max_convex_hull=min(share, PIECES),
-            seed=0,
-            **CUT,
-        )
-        found = [_true_to_size(thinned(_corners(vertices)), part) for vertices, _ in cut if hull_volume(vertices)]
-        # Slivers along the cuts.
-        hulls += [vertices for vertices in found if hull_volume(vertices) >= LEAST_VOLUME] or found
-    return {f"piece{i:02}": vertices for i, vertices in enumerate(hulls)}
+    cut = coacd.run_coacd(
+        coacd.Mesh(np.asarray(part.vertices), np.asarray(part.faces)),
+        threshold=CONCAVITY,
+        max_convex_hull=PIECES,
+        seed=0,
+        **CUT,
+    )
+    found = [thinned(_corners(vertices)) for vertices, _ in cut if hull_volume(vertices)]
+    low, high = part.bounds
+    if any(np.max([low - corners, corners - high]) > REMESHED for corners in found):
+        found = [_true_to_size(corners, part) for corners in found]
+    # Without slivers along the cuts.
+    return [vertices for vertices in found if hull_volume(vertices) >= LEAST_VOLUME] or found
+
+
+def joined(hulls: Sequence[Float[np.ndarray, "n 3"]], most: int = MOST_SOLIDS) -> list[Float[np.ndarray, "n 3"]]:
+    """At most so many convex polyhedra, by their vertices: always the two neighbours are joined whose hull holds least
+    that neither holds."""
+    left = {i: thinned(_corners(vertices)) for i, vertices in enumerate(hulls)}
+    volumes = {i: hull_volume(vertices) for i, vertices in left.items()}
+    gains: dict[tuple[int, int], float] = {}
+    for new in range(len(left), 2 * len(left) - most):
+        names = np.array(list(left))
+        tree = cKDTree([vertices.mean(axis=0) for vertices in left.values()])
+        near = names[tree.query(tree.data, k=min(NEIGHBOURS, len(names)))[1]]
+        pairs = {
+            (min(i, j), max(i, j)) for i, row in zip(names.tolist(), near.tolist(), strict=True) for j in row if i != j
+        }
+        for i, j in pairs - gains.keys():
+            gains[i, j] = hull_volume(np.concatenate([left[i], left[j]])) - volumes[i] - volumes[j]
+        i, j = min(pairs, key=lambda pair: (gains[pair], pair))
+        left[new] = thinned(_corners(np.concatenate([left.pop(i), left.pop(j)])))
+        volumes[new] = hull_volume(left[new])
+    return list(left.values())
 
 
 def _true_to_size(corners: Float[np.ndarray, "n 3"], part: Trimesh) -> Float[np.ndarray, "n 3"]:
     """Corners of a piece of a part, without what remeshing has added: those outside are moved to the surface."""
-    low, high = part.bounds
-    if np.max([low - corners.min(axis=0), corners.max(axis=0) - high]) <= REMESHED:
-        return corners
     moved = np.where(turns_around(part, corners)[:, None] < 0.5, nearest(part, corners)[0], corners)
     return _corners(moved) if hull_volume(moved) else corners
 
@@ -255,10 +274,10 @@ def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
 
     Seams are welded, faces turned outwards, holes filled; loose parts that are tiny or flat, and closed ones inside
     others, are left out, see `surfaces.mending`. A mesh of at most 16 connected parts that are convex then is taken as
-    it is. Of any other, each part is cut into at most `PIECES` pieces, all together where there would be too many;
-    always the same, which are kept on disk, see `runtime.kept_arrays`. A `Note` warns of all that was filled or left
-    out, where pieces are more than 1 mm off the surface, and where they are thinner than `LEAST_THICKNESS` and are made
-    so thick.
+    it is. Of any other, each part that is not convex is cut into at most `PIECES` pieces, and pieces are joined where
+    there are too many; always the same, which are kept on disk, see `runtime.kept_arrays`. A `Note` warns of all that
+    was filled or left out, where pieces are more than 1 mm off the surface, and where they are thinner than
+    `LEAST_THICKNESS` and are made so thick.
 
     Args:
       path: of the file.
