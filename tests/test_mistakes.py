@@ -122,8 +122,11 @@ MISTAKES = {
     "depth: of another camera or resolution": lambda tmp: look(DEPTH[::2, ::2]),
     "depth: transposed": lambda tmp: look(DEPTH.T.copy()),
     "depth: upside down": lambda tmp: look(DEPTH[::-1].copy()),
+    "depth: turned by 180 degrees": lambda tmp: look(DEPTH[::-1, ::-1].copy()),
     "depth: left and right exchanged": lambda tmp: look(DEPTH[:, ::-1].copy()),
     "depth: NaN, 0 or infinite everywhere": lambda tmp: look(np.full_like(DEPTH, np.nan)),
+    "depth: 65.535 everywhere": lambda tmp: look(np.full_like(DEPTH, 65.535)),
+    "depth: a thing without depth": lambda tmp: look(np.where(MASK == 0, 0, DEPTH)),
     "depth: the same everywhere": lambda tmp: look(np.full_like(DEPTH, 0.8)),
     "depth: most pixels not measured": lambda tmp: look(
         np.where(np.arange(DEPTH.size).reshape(DEPTH.shape) % 3, 0, DEPTH)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.images.checks.holes import hole_faults, unmeasured_target_faults
 from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.checks.usable import check_images
 from mechsearch_jax.images.trained_view import view_faults
@@ -63,7 +64,7 @@ def check_image(
 
 def image_warnings(setting: Setting, recogniser: Any, look: Look, target_id: int | None) -> list[str]:
     """Warnings about images that do not fit camera, shelf and target, beside the place of the shelf."""
-    faults = list(image_faults(look))
+    faults = [*image_faults(look), *hole_faults(look)]
     faults += edge_faults(look.camera, look.shelf, look.depth, look.colour)
     faults += mask_faults(look.camera, look.shelf, look.depth, look.mask)
     # Another recogniser may identify the target in another way.
@@ -76,8 +77,11 @@ def image_warnings(setting: Setting, recogniser: Any, look: Look, target_id: int
 
 def recognition_warnings(setting: Setting, look: Look, observation: Observation) -> list[str]:
     """Warnings about what is recognised: not the target, too much, or objects in each other."""
-    coloured = look.detector is not None and look.colour is not None and look.mask is None
-    other = detection_faults(look, observation) if coloured else ()
+    other: list[str] = []
+    if look.detector is not None and look.colour is not None:
+        other += unmeasured_target_faults(look, observation)
+        if look.mask is None:
+            other += detection_faults(look, observation)
     return [*other, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
 
 

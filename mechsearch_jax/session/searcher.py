@@ -259,7 +259,7 @@ class Searcher:
         drawn.
 
         Args:
-          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured.
+          depth: float (H, W), metres along the camera's z; 0, NaN or 65.535 where nothing was measured.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), the number of the object that a pixel shows; see `Recogniser`.
           target_id: the target's number in the mask; negative where the mask does not show it.
