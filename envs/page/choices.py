@@ -188,7 +188,7 @@ def _possible(recording: Recording, step: RecordedStep) -> PossibleSpace:
     target, shelf = recording.target, recording.shelf
     grid = step.existence.reshape(*target.grid, -1).sum(axis=-1) * (not step.found)
     cell = np.asarray(target.cell(shelf)[:2], np.float32)
-    space = bordered(widen(jnp.asarray(grid > 0)), False)
+    space = bordered(widen(jnp.asarray(grid > 0)))
     return PossibleSpace(
         target=jnp.where(space, jnp.float32(shelf.board + target.tall), -jnp.inf),
         unmeasured=jnp.full(space.shape, -jnp.inf),

@@ -35,9 +35,9 @@ class PossibleSpace(flax.struct.PyTreeNode):
     cell: jax.Array
 
 
-def bordered(cells: Array, value: float) -> Array:
-    """A raster with a border of a value."""
-    return jnp.pad(cells, BORDER, constant_values=value)
+def bordered(cells: Bool[Array, "r c"]) -> Bool[Array, "rows columns"]:
+    """A raster with a border of cells that are False."""
+    return jnp.pad(cells, BORDER)
 
 
 def widen(cells: Bool[Array, "r c"]) -> Bool[Array, "r c"]:

@@ -201,7 +201,7 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
         grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
     top = problem.shelf.board + problem.target.tall
     return PossibleSpace(
-        target=jnp.where(bordered(widen(grid > 0), False), top, -jnp.inf),
+        target=jnp.where(bordered(widen(grid > 0)), top, -jnp.inf),
         unmeasured=belief.unmeasured,
         chance=grid / jnp.maximum(jnp.sum(grid), 1),
         origin=problem.poses[0, :2] - BORDER * problem.cell,
