@@ -8,8 +8,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.workspace import scenario as scenarios
+from mechsearch_jax.workspace.compound_file import parse_compound
 
 UPRIGHT = [1.0, 0.0, 0.0, 0.0]
 QUARTER = [0.5**0.5, 0.0, 0.0, 0.5**0.5]
@@ -163,3 +164,12 @@ def test_a_mesh_in_millimetres_is_noticed(tmp_path):
     (tmp_path / "scene.json").write_text(json.dumps(scene(MESH)))
     with pytest.raises(InputError, match=r"200 m long, more than 1\.0; give its unit as scale, such as 0\.001"):
         scenarios.load_scenario(tmp_path / "scene.json")
+
+
+def test_parts_of_a_mesh_that_are_too_small_are_named_as_the_cause(tmp_path):
+    needle = trimesh.creation.box((0.003, 0.0001, 0.0001)).apply_translation((0.1, 0, 0))
+    trimesh.util.concatenate([trimesh.creation.box((0.05, 0.05, 0.06)), needle]).export(tmp_path / "scan.stl")
+    body = {"mesh": "scan.stl", "density": 500, "friction": 0.4}
+    cause = "1 of its 2 loose parts have less than 1 mm3, the largest 150 cm3; delete the small ones"
+    with pytest.warns(Note), pytest.raises(InputError, match=cause):
+        parse_compound(body, (), "here", tmp_path)

@@ -177,7 +177,7 @@ def _is_convex(part) -> bool:
     return bool(part.is_watertight and part.volume >= CONVEX_SHARE * part.convex_hull.volume)
 
 
-def _decomposed(parts: Sequence[Trimesh], path: Path, where: str) -> dict[str, Float[np.ndarray, "n 3"]]:
+def _decomposed(parts: Sequence[Trimesh], path: Path, where: str) -> dict[str, Float[np.ndarray, "_ 3"]]:
     """Vertices of convex pieces that together are about a mesh of several parts, by names in their order."""
     hulls = []
     for part in parts:
@@ -185,7 +185,7 @@ def _decomposed(parts: Sequence[Trimesh], path: Path, where: str) -> dict[str, F
     return {f"piece{i:02}": vertices for i, vertices in enumerate(joined(hulls))}
 
 
-def _cut(part: Trimesh, path: Path, where: str) -> list[Float[np.ndarray, "n 3"]]:
+def _cut(part: Trimesh, path: Path, where: str) -> list[Float[np.ndarray, "_ 3"]]:
     """Vertices of convex pieces that together are about a connected part."""
     try:
         import coacd  # pyright: ignore[reportMissingImports]
@@ -210,7 +210,7 @@ def _cut(part: Trimesh, path: Path, where: str) -> list[Float[np.ndarray, "n 3"]
     return [vertices for vertices in found if hull_volume(vertices) >= LEAST_VOLUME] or found
 
 
-def joined(hulls: Sequence[Float[np.ndarray, "n 3"]], most: int = MOST_SOLIDS) -> list[Float[np.ndarray, "n 3"]]:
+def joined(hulls: Sequence[Float[np.ndarray, "_ 3"]], most: int = MOST_SOLIDS) -> list[Float[np.ndarray, "_ 3"]]:
     """At most so many convex polyhedra, by their vertices: always the two neighbours are joined whose hull holds least
     that neither holds."""
     left = {i: thinned(_corners(vertices)) for i, vertices in enumerate(hulls)}

@@ -86,7 +86,7 @@ def farthest_outside(mesh: Trimesh, points: Float[np.ndarray, "n 3"], least: flo
     return farthest if farthest > least else 0.0
 
 
-def beyond(hulls: Sequence[Float[np.ndarray, "n 3"]], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
+def beyond(hulls: Sequence[Float[np.ndarray, "_ 3"]], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
     """How far points are outside of all of several convex polyhedra, given by vertices [m].
 
     That is the distance to the plane of a face: before an edge or a corner it is less than the true one.
@@ -95,7 +95,7 @@ def beyond(hulls: Sequence[Float[np.ndarray, "n 3"]], points: Float[np.ndarray, 
     return np.clip(np.min([np.max(points @ p[:, :3].T + p[:, 3], axis=1) for p in planes], axis=0), 0.0, None)
 
 
-def deviation(mesh: Trimesh, hulls: Sequence[Float[np.ndarray, "n 3"]], least: float) -> tuple[float, float]:
+def deviation(mesh: Trimesh, hulls: Sequence[Float[np.ndarray, "_ 3"]], least: float) -> tuple[float, float]:
     """How far convex polyhedra, given by their vertices, reach out of a surface, and how far inside of it they stay, at
     sampled points [m]; the first is 0 up to `least`."""
     import trimesh

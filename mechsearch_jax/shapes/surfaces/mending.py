@@ -89,7 +89,9 @@ def _welded(mesh: Trimesh) -> Trimesh:
         # The first vertex of each group stands for it.
         first = np.unique(same, return_index=True)[1]
         mesh = type(mesh)(mesh.vertices, first[same][mesh.faces], process=False)
-    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    # Those that welding has made lines; to leave out slivers would open holes.
+    faces = np.asarray(mesh.faces)
+    mesh.update_faces(np.all(faces != np.roll(faces, 1, axis=1), axis=1) & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     return mesh
 
@@ -141,7 +143,6 @@ def _closed(part: Trimesh) -> tuple[Trimesh, list[float]]:
         widths.append(float(np.ptp(around.reshape(-1, 3), axis=0).max()))
     lids = np.column_stack([border[:, ::-1], len(vertices) + hole])
     closed = type(part)(np.concatenate([vertices, centres]), np.concatenate([part.faces, lids]), process=False)
-    closed.update_faces(closed.nondegenerate_faces())
     encloses = abs(closed.volume) > FLAT * np.prod(closed.extents)
     return (closed, widths) if encloses and closed.is_watertight else (part, [])
 
