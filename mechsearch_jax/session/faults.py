@@ -12,6 +12,7 @@ from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import lost_faults
 from mechsearch_jax.perception.edges import edge_faults, mask_faults
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
@@ -73,7 +74,8 @@ def image_warnings(setting: Setting, recogniser: Any, images: Images, observatio
 def recognition_warnings(setting: Setting, depth: np.ndarray, observation: Observation) -> list[str]:
     """Warnings about what is recognised: nothing, too much, or objects in each other."""
     unseen = sight_faults(setting.camera, setting.shelf, depth, observation)
-    return [*unseen, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
+    lost = () if unseen else lost_faults(setting, observation, depth)
+    return [*unseen, *lost, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
 
 
 def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:
