@@ -197,7 +197,7 @@ def recognition_doubt(
 
 
 def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndarray, "h w"]) -> tuple[str, ...]:
-    """Warnings about surfaces on the shelf, large enough for an object, that lie on nothing that is recognised.
+    """A warning if surfaces on the shelf, large enough for an object, lie on nothing that is recognised.
 
     Args:
       setting, observation, depth: as of `recognition_doubt`.
@@ -216,9 +216,14 @@ def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndar
     pixels = np.bincount(surface) * view.stride**2
     off = np.bincount(surface, gap > DoubtConfig.tolerance) * view.stride**2
     lost = np.flatnonzero((pixels > SAMPLED * found_pixels(camera)) & (off > LOST * pixels))
-    return tuple(
-        f"recognition: what shows {pixels[i]} pixels at ({x:.2f}, {y:.2f}, {z:.2f}) m lies on no recognised object"
-        for i, (x, y, z) in ((i, points[surface == i].mean(axis=0)) for i in lost)
+    if not len(lost):
+        return ()
+    largest = lost[np.argmax(pixels[lost])]
+    x, y, z = points[surface == largest].mean(axis=0)
+    more = f", nor do {len(lost) - 1} others" if len(lost) > 1 else ""
+    return (
+        f"recognition: what shows {pixels[largest]} pixels at ({x:.2f}, {y:.2f}, {z:.2f}) m does not lie on anything "
+        f"that is recognised{more}",
     )
 
 
