@@ -1,4 +1,6 @@
-"""Edges of depth, colour and mask: they are compared, and a mask's pixels on other surfaces are left out."""
+"""Edges of depth, colour and mask; surfaces: of a mask, of a cloud, and those on which nothing is recognised."""
+
+import types
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,12 @@ from scipy.ndimage import grey_dilation, minimum_filter
 
 from mechsearch_jax.images.cloud import cloud_of, resample
 from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import lost_faults
 from mechsearch_jax.perception.edges import edge_faults, mask_faults, on_own_surfaces
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 IMAGES, SHELF = example_images(), Shelf()
 DEPTH, COLOUR, MASK = IMAGES.depth, IMAGES.colour, IMAGES.mask.astype(np.int32)
@@ -122,3 +128,17 @@ def test_small_surfaces_are_not_left_out_of_a_cloud():
     assert np.array_equal(resample(key, cloud, 512, large).pixel, resample(key, cloud, 512).pixel)
     empty = cloud.replace(valid=jnp.zeros(10_000, bool))
     assert not resample(key, empty, 512, number).valid.any()
+
+
+SCENE = load_scenario(example_scenarios()["first-light"])
+SETTING = types.SimpleNamespace(camera=IMAGES.camera, shelf=SHELF, target=Target.cylinder())
+
+
+@pytest.mark.parametrize("missed", [None, *range(len(SCENE.objects))])
+def test_a_surface_on_which_nothing_is_recognised_is_said(missed):
+    objects = superquadrics(SCENE.objects)
+    if missed is not None:
+        objects = objects.replace(valid=objects.valid.at[missed].set(False))
+    faults = lost_faults(SETTING, Observation(objects, jnp.array(False), jnp.zeros(3)), DEPTH)
+    assert len(faults) == (missed is not None)
+    assert all(fault.startswith("recognition: what shows ") for fault in faults)

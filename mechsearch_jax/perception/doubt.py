@@ -10,16 +10,19 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from mechsearch_jax.images.cloud import OVERHANG, shelf_view
+from mechsearch_jax.images.cloud import OVERHANG, View, above_board, shelf_view, surfaces, thinned_view
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.recogniser import Setting
+from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.parts import parts_of
 from mechsearch_jax.shapes.solid import Solid
-from mechsearch_jax.workspace.camera import Camera, measured
+from mechsearch_jax.workspace.camera import Camera, back_project, measured
+from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -29,6 +32,8 @@ PIXELS = 20_000
 FEWEST_POINTS = 50
 # Points within this distance of the shelf's faces count as the shelf [m].
 FACES = 0.012
+# A surface is lost if more than this share of its points is on nothing that is recognised.
+LOST = 0.6
 # Objects that fewer rays reach are ignored.
 FEWEST_RAYS = 20
 # Width of the square inside a round object, relative to its diameter.
@@ -189,6 +194,44 @@ def recognition_doubt(
     unexplained = float((gap > tolerance).mean()) if enough else 0.0
     passed = [(_passed(thing, origin, rays, depths, tolerance), thing.name) for thing in things]
     return Doubt(missing, unexplained, *max(passed, default=(0.0, "")))
+
+
+def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndarray, "h w"]) -> tuple[str, ...]:
+    """A warning if surfaces on the shelf, large enough for an object, lie on nothing that is recognised.
+
+    Args:
+      setting, observation, depth: as of `recognition_doubt`.
+
+    Raises:
+      InputError: the camera does not see the shelf.
+    """
+    camera, shelf = setting.camera, setting.shelf
+    view = thinned_view(camera, shelf)
+    points, standing, number = (np.asarray(a) for a in _surfaces(view, shelf, view.of(jnp.asarray(depth, jnp.float32))))
+    points, number = points[standing], number[standing]
+    gap = np.full(len(points), np.inf)
+    for thing in things_of(shelf, setting.target, observation):
+        gap = np.minimum(gap, thing.gap(points))
+    surface = np.unique(number, return_inverse=True)[1]
+    pixels = np.bincount(surface) * view.stride**2
+    off = np.bincount(surface, gap > DoubtConfig.tolerance) * view.stride**2
+    lost = np.flatnonzero((pixels > SAMPLED * found_pixels(camera)) & (off > LOST * pixels))
+    if not len(lost):
+        return ()
+    largest = lost[np.argmax(pixels[lost])]
+    x, y, z = points[surface == largest].mean(axis=0)
+    more = f", nor do {len(lost) - 1} others" if len(lost) > 1 else ""
+    return (
+        f"recognition: what shows {pixels[largest]} pixels at ({x:.2f}, {y:.2f}, {z:.2f}) m does not lie on anything "
+        f"that is recognised{more}",
+    )
+
+
+@kept()
+def _surfaces(view: View, shelf: Shelf, depth: Array) -> tuple[Array, Array, Array]:
+    """Points of a view, which of them stand on the shelf, and the numbers of their surfaces."""
+    points = back_project(view.camera, jnp.where(measured(depth), depth, jnp.nan))
+    return points, above_board(shelf, points, FACES), surfaces(points, above_board(shelf, points))
 
 
 def check_recognition(setting: Setting, observation: Observation, depth: Any, config: DoubtConfig) -> None:

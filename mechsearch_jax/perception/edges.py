@@ -19,8 +19,11 @@ from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import longer
 from mechsearch_jax.workspace.shelf import Shelf
 
-# An end of a surface: what is measured next, at most so many pixels on, is farther by this [m].
+# An end of a surface: what is measured next, after at most so many pixels without a depth, is farther by this [m].
 JUMP, GAP = 0.04, 24
+# Beside a mask's edges fewer may be without one: along a column so few that a slanted face of which little was measured
+# has no ends. And points so near to the shelf's faces are not judged, for they may be the shelf's [m].
+GAPS, FACES = (2, 8), 0.015
 # How far from an end other edges are looked for [pixels], and how many ends must be seen to say anything.
 REACH, ENDS = 12, 60
 # Nearer surfaces may reach so far beyond their edges in the colour image [pixels of 1280 x 720, but at least of the
@@ -33,15 +36,17 @@ LEFT_OUT, LEAST_LEFT_OUT = 0.1, 100
 
 
 class Ends(NamedTuple):
-    """Where surfaces end in one direction along the rows of an image that was turned so that the direction is right.
+    """Where surfaces end in one direction, in an image that was turned so that the direction is to the right.
 
     Attributes:
       row, column: of the last pixel of each surface.
-      turn: turns an image in the same way.
+      gap: number of pixels without a depth after it.
+      axis, sign: the direction: 1 for along rows, 0 for along columns; 1 upwards, -1 downwards in number.
     """
 
     row: np.ndarray
     column: np.ndarray
+    gap: np.ndarray
     axis: int
     sign: int
 
@@ -54,21 +59,22 @@ class Ends(NamedTuple):
 
 
 def ends_of(depth: Float[np.ndarray, "h w"], axis: int, sign: int) -> Ends:
-    """The ends of surfaces in a direction: `axis` 1 for columns, 0 for rows; `sign` 1 upwards, -1 downwards in number.
-
-    What is not measured, such as the shadow of a stereo camera, is passed over.
-    """
-    ends = Ends(np.zeros(0, int), np.zeros(0, int), axis, sign)
-    turned = ends.turned(depth)
-    measured, width = np.isfinite(turned) & (turned > 0), turned.shape[1]
-    following = np.where(measured, np.arange(width), width)
+    """The ends of surfaces in a direction; what is not measured, such as a stereo camera's shadow, is passed over."""
+    ends = Ends(*[np.zeros(0, int)] * 3, axis, sign)
+    turned = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
+    turned = np.pad(ends.turned(turned), ((0, 0), (1, 1)), constant_values=np.nan)
+    width = turned.shape[1]
+    following = np.where(np.isnan(turned), width, np.arange(width))
     following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1][:, 1:]
-    beyond = np.take_along_axis(turned, np.minimum(following, width - 1), axis=1)
-    near = (following < width) & (following - np.arange(width - 1) <= GAP)
-    with np.errstate(invalid="ignore"):
-        row, column = np.nonzero(measured[:, :-1] & near & (beyond - turned[:, :-1] > JUMP))
-    inside = (column >= REACH) & (column < width - REACH - 1)
-    return ends._replace(row=row[inside], column=column[inside])
+    gap = following - np.arange(width - 1) - 1
+    beyond, farther = (np.take_along_axis(turned, np.minimum(following + i, width - 1), axis=1) for i in (0, 1))
+    # Of two pixels on either side, lest noise on slanted surfaces make ends.
+    before, last = np.roll(turned, 1, axis=1)[:, :-1], turned[:, :-1]
+    jumps = np.minimum(beyond, farther) - np.maximum(before, last) > JUMP
+    row, column = np.nonzero(jumps & (gap <= GAP))
+    inside = (column > REACH) & (column < width - REACH - 2)
+    row, column = row[inside], column[inside]
+    return ends._replace(row=row, column=column - 1, gap=gap[row, column])
 
 
 def edge_faults(
@@ -142,7 +148,7 @@ def _away_from_edges(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.n
     view = shelf_view(camera, shelf, 1)
     depth, mask = (np.asarray(view.of(jnp.asarray(image))) for image in (depth, mask))
     points = back_project(view.camera, jnp.asarray(np.where(depth > 0, depth, np.nan)))
-    standing = np.asarray(above_board(shelf, points))
+    standing = np.asarray(above_board(shelf, points, FACES))
     named = np.where((mask >= 0) & (mask < INSTANCES), mask, OTHER)
     near = round(max(1.0, NEAR * longer(camera)))
     shares = []
@@ -150,10 +156,11 @@ def _away_from_edges(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.n
         ends = ends_of(depth, axis, sign)
         pixels = ends.along(named)
         # What has no number anywhere near is not in the mask.
-        judged = ends.along(standing)[:, REACH] & (pixels >= 0).any(axis=1)
+        judged = ends.along(standing)[:, REACH] & (pixels >= 0).any(axis=1) & (ends.gap <= GAPS[axis])
         if judged.sum() >= ENDS:
-            within = np.diff(pixels[judged], axis=1)[:, REACH - near : REACH + near + 1]
-            shares.append(float((within != 0).any(axis=1).mean()))
+            off = np.arange(-REACH, REACH + 1)[None]
+            within = (np.diff(pixels, axis=1) != 0) & (off >= -near) & (off <= ends.gap[:, None] + near)
+            shares.append(float(within.any(axis=1)[judged].mean()))
     if min(shares, default=1.0) >= LEAST_NEAR:
         return None
     return f"at {100 - 100 * min(shares):.0f}% of the places where depth jumps, it has no edge within {near} pixels"

@@ -14,6 +14,7 @@ from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.checks.usable import check_images
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import lost_faults
 from mechsearch_jax.perception.edges import edge_faults, mask_faults
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
@@ -21,6 +22,7 @@ from mechsearch_jax.perception.plausibility import (
     detection_faults,
     identity_faults,
     image_faults,
+    shows_nothing,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, Setting
 from mechsearch_jax.problem.workcell import Workcell
@@ -76,12 +78,14 @@ def image_warnings(setting: Setting, recogniser: Any, look: Look, target_id: int
 
 
 def recognition_warnings(setting: Setting, look: Look, observation: Observation) -> list[str]:
-    """Warnings about what is recognised: not the target, too much, or objects in each other."""
+    """Warnings about what is recognised: not the target, not all, too much, or objects in each other."""
     other: list[str] = []
     if look.detector is not None and look.colour is not None:
         other += unmeasured_target_faults(look, observation)
         if look.mask is None:
             other += detection_faults(look, observation)
+    if not shows_nothing(observation):
+        other += lost_faults(setting, observation, look.depth)
     return [*other, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
 
 
