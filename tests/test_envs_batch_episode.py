@@ -33,6 +33,7 @@ WON = Result(
     off_board=frozenset(),
     held_up=False,
     at_rest=True,
+    restless=(),
     tracking_error=0.001,
 )
 

@@ -75,7 +75,8 @@ class Toy:
         fallen = np.array(self.world.valid & (self.world.position[..., 0] < Shelf().front))
         flags = {name: np.zeros(count, bool) for name in ("held", "outside")}
         return Outcome(
-            failure=failure, steps=np.ones(count, np.int32), settled=np.ones(count, bool), fallen=fallen,
+            failure=failure, steps=np.ones(count, np.int32), settled=np.ones(count, bool),
+            restless=np.zeros_like(fallen), fallen=fallen,
             retrieved=retrieved, overflow=np.zeros(count, np.int32), tracking_error=np.zeros(count), **flags,
         )  # fmt: skip
 

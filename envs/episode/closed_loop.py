@@ -245,7 +245,7 @@ class EpisodePool:
             r: (None, trouble.get(r)) for r in decided if r not in acting
         }
         if executed is not None:
-            ends |= {r: _result(executed, r) for r in executed.choices.keys() | executed.stuck}
+            ends |= {r: self._result(executed, r) for r in executed.choices.keys() | executed.stuck}
         done: list[tuple[int, tuple[int, Episode]]] = []
         for r, (result, why) in sorted(ends.items()):
             slot = self.running[r]
@@ -256,6 +256,15 @@ class EpisodePool:
             outcome = None if executed is None else jax.tree.map(lambda a: a[0], executed.outcome)
             self._listeners.watcher.acted(dataclasses.replace(moment, record=decided[0].log.steps[-1], outcome=outcome))
         return done
+
+    def _result(self, executed: Execution, row: int) -> tuple[Result | None, str | None]:
+        """What came of what was executed in a slot, and why its episode cannot go on, if so."""
+        if row in executed.stuck:
+            return None, ALL_FAILED
+        outcome, world = executed.outcome, self._simulator.world
+        assert world is not None
+        result = result_of(executed.choices[row], outcome, row, world, self._problem.shelf)
+        return result, overflow_trouble(outcome, row)
 
     def _executed(self, choices: Mapping[int, Choice]) -> Execution:
         """Execute what was decided in some slots; what came of it in those whose actions are over."""
@@ -297,10 +306,3 @@ def keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) ->
     """The planner's and the environment's key of every slot at its present step."""
     keys, fold = jax.random.wrap_key_data(data), jax.vmap(jax.random.fold_in)
     return fold(keys[:, 0], steps), fold(keys[:, 1], steps)
-
-
-def _result(executed: Execution, row: int) -> tuple[Result | None, str | None]:
-    """What came of what was executed in a slot, and why its episode cannot go on, if so."""
-    if row in executed.stuck:
-        return None, ALL_FAILED
-    return result_of(executed.choices[row], executed.outcome, row), overflow_trouble(executed.outcome, row)

@@ -16,7 +16,8 @@ from mechsearch_jax.envs.episode.numbering import named_action
 from mechsearch_jax.envs.episode.records import ActionRecord, Episode, Step, record_action
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
-from mechsearch_jax.envs.world.world import TARGET, fallen_over
+from mechsearch_jax.envs.world.touching import unrest
+from mechsearch_jax.envs.world.world import TARGET, World, fallen_over
 from mechsearch_jax.planner import Decision
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.versions import versions
@@ -107,7 +108,7 @@ class Result:
       retrieved: whether a retrieval succeeded and nothing fell meanwhile.
       final: whether another attempt cannot succeed.
       off_board: bodies that are off the board after the action.
-      held_up, at_rest, tracking_error: as in `Step`.
+      held_up, at_rest, restless, tracking_error: as in `Step`.
     """
 
     failure: str | None
@@ -117,11 +118,12 @@ class Result:
     off_board: frozenset[int]
     held_up: bool
     at_rest: bool
+    restless: tuple[str, ...]
     tracking_error: float
 
 
-def result_of(choice: Choice, outcome: Outcome, i: int) -> Result:
-    """The result of the action in world `i`."""
+def result_of(choice: Choice, outcome: Outcome, i: int, world: World, shelf: Shelf) -> Result:
+    """The result of the action in world `i` of all worlds on a shelf, after it."""
     code, takes = Failure(int(outcome.failure[i])), takes_target(choice)
     # The grasp stays out of reach, a fallen body stays off the board, and a target outside cannot be taken out again.
     final = code in (Failure.UNREACHABLE, Failure.FALLEN) or bool(outcome.held[i] & outcome.outside[i])
@@ -133,6 +135,7 @@ def result_of(choice: Choice, outcome: Outcome, i: int) -> Result:
         off_board=frozenset(np.flatnonzero(outcome.fallen[i]).tolist()),
         held_up=code is Failure.HELD_UP,
         at_rest=bool(outcome.settled[i]),
+        restless=unrest(world, np.asarray(outcome.restless[i]), shelf, i),
         tracking_error=float(outcome.tracking_error[i]),
     )
 
@@ -279,6 +282,7 @@ class EpisodeLog:
             target_fallen=TARGET in left,
             held_up=result.held_up,
             at_rest=result.at_rest,
+            restless=result.restless,
             tracking_error=result.tracking_error,
         )
         if objects and self.irretrievable is None:

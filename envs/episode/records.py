@@ -77,6 +77,7 @@ class Step:
       target_fallen: whether the target did; False while it is in the hand.
       held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`, and `Mismatch.arm_stop`.
       at_rest: whether everything came to rest after the action; False also where the simulation diverged.
+      restless: what did not, in words, as "object 0 leans on the back wall"; None in records that do not say.
       tracking_error: largest distance of a joint from its reference [rad].
       paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
       around_possible: whether f holds any candidate pose of the true pose's cell or of the eight cells around it; None
@@ -102,6 +103,7 @@ class Step:
     target_fallen: bool | None = None
     held_up: bool | None = None
     at_rest: bool | None = None
+    restless: tuple[str, ...] | None = None
     tracking_error: float | None = None
     paper_graspable: bool = False
     around_possible: bool | None = None
@@ -187,11 +189,12 @@ def episode_of(value: Any) -> Episode:
 
 def _step(value: Any) -> Step:
     """A step from its JSON values."""
-    action, fallen = value["action"], value.get("fallen")
+    action, fallen, restless = value["action"], value.get("fallen"), value.get("restless")
     return Step(
         **{
             **value,
             "action": None if action is None else ActionRecord(**action),
             "fallen": None if fallen is None else tuple(fallen),
+            "restless": None if restless is None else tuple(restless),
         }
     )

@@ -128,8 +128,13 @@ def events(record: Step) -> list[str]:
     if record.target_fallen:
         messages.append("the target fell off the board")
     if record.at_rest is False:
-        messages.append("something never came to rest, and was stopped as it moved")
+        messages.append(f"{_what_moves(record)}, never came to rest, and was stopped")
     return messages
+
+
+def _what_moves(record: Step) -> str:
+    """What did not come to rest, and where it is."""
+    return " and ".join(record.restless or ()) or "something moved on"
 
 
 def verdict(episode: Episode) -> str:
@@ -151,7 +156,9 @@ def verdict(episode: Episode) -> str:
             recorded = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)
             parts[-1] += f" ({when} with the paper's grasps)" if recorded else ""
         parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
-    restless = [str(i + 1) for i, step in enumerate(episode.steps) if step.at_rest is False]
-    if restless:
-        parts.append(f"something never came to rest after action {', '.join(restless)}")
+    parts += [
+        f"{_what_moves(step)} and never came to rest after action {i + 1}"
+        for i, step in enumerate(episode.steps)
+        if step.at_rest is False
+    ]
     return f"{episode.scenario}: {', '.join(parts)}"

@@ -390,8 +390,8 @@ class MjxSimulator:
         (data, progress), _ = jax.lax.scan(lambda state, _: (step(state), None), state, None, steps)
         world, fallen = taken_over(self.shelf, world, data.qpos, everywhere)
         failure = jnp.where(progress.diverged, int(Failure.UNSTABLE), int(Failure.NONE)).astype(jnp.int32)
-        none = ~everywhere
-        rest = (progress.steps, none, fallen, none, none, none, progress.overflow, progress.error)
+        none, still = ~everywhere, jnp.zeros_like(fallen)
+        rest = (progress.steps, none, still, fallen, none, none, none, progress.overflow, progress.error)
         return data, world, Outcome(failure, *rest)
 
     def _time_step(self, fields: BodyFields, task: Task):

@@ -59,7 +59,7 @@ class Progress(flax.struct.PyTreeNode):
     Attributes:
       done: whether nothing is left to simulate.
       settled, diverged: how it ended.
-      moving: whether any body was not at rest in the present block of steps.
+      moving: which bodies were not at rest in the present block of steps, or in the last one, shape (W, 9).
       steps: simulated so far.
       overflow: flags of `Overflow` so far.
       at_grasp, at_release: configurations when the hand has closed, and when it begins to open, shape (W, nq).
@@ -152,10 +152,10 @@ def merged(
 
 def begin(task: Task, data: Any) -> Progress:
     """Progress before the first step; worlds without a task are done."""
-    none = jnp.zeros(len(task.moves), bool)
+    none, still = jnp.zeros(len(task.moves), bool), jnp.zeros((len(task.moves), BODIES), bool)
     zero = jnp.zeros(len(task.moves), jnp.int32)
     q = data.qpos[:, :ARM]
-    return Progress(~task.moves, ~task.moves, none, none, zero, zero, data.qpos, data.qpos, q, jnp.zeros_like(q[:, 0]))
+    return Progress(~task.moves, ~task.moves, none, still, zero, zero, data.qpos, data.qpos, q, jnp.zeros_like(q[:, 0]))
 
 
 def advance(
@@ -199,9 +199,9 @@ def advance(
     resting = i + 1 - task.length
     limit = config.rest_speed * jnp.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
     speed = jnp.abs(qvel[:, ROBOT:]).reshape(-1, BODIES, 6)
-    moving = progress.moving | ((resting >= 1) & jnp.any(speed >= limit[None, None], axis=(1, 2)))
+    moving = progress.moving | ((resting >= 1)[:, None] & jnp.any(speed >= limit[None, None], axis=2))
     looks = (resting >= 1) & (resting % config.settle_block == 0)
-    rests = looks & ~moving
+    rests = looks & ~jnp.any(moving, axis=1)
     late = resting >= config.settle_steps // config.settle_block * config.settle_block
     reference = unhindered(progress.reference, row[:, :ARM], config.motion.timestep)
     off = jnp.max(jnp.abs(qpos[:, :ARM] - reference), axis=1)
@@ -210,7 +210,7 @@ def advance(
         done=frozen | diverged | rests | late,
         settled=jnp.where(frozen, progress.settled, rests & ~diverged),
         diverged=progress.diverged | diverged,
-        moving=moving & ~looks,
+        moving=where(frozen, progress.moving, moving & ~(looks & ~late)[:, None]),
         steps=progress.steps + ~frozen,
         overflow=progress.overflow | jnp.where(frozen, 0, overflow_of(after._impl.overflow)),
         at_grasp=where(i + 1 == task.closed, qpos, progress.at_grasp),
@@ -287,6 +287,7 @@ def verdicts(
         failure=failure,
         steps=progress.steps,
         settled=progress.settled,
+        restless=progress.moving & ~progress.settled[:, None] & ~progress.diverged[:, None],
         fallen=fallen,
         held=held,
         outside=outside,

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions import Action
-from mechsearch_jax.envs.simulators.native_world import NativeWorld, outcome_of
+from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, check_actions
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
-from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.outcome import Failure, Outcome, outcome_of
 from mechsearch_jax.envs.world.world import BODIES, World, alike
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError

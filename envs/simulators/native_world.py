@@ -27,7 +27,8 @@ from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.trace import Recorder, Trace
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
-from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.outcome import Failure, Outcome, outcome_of
+from mechsearch_jax.envs.world.touching import Touch, touches
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
@@ -45,6 +46,7 @@ class NativeWorld:
     Attributes:
       shelf, camera, config: as given.
       world: the present state; None before the first `reset` or `load`.
+      restless: which bodies did not come to rest the last time that they were given time to, shape (9,).
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class NativeWorld:
         self._model = self._blank
         self._bodies: list[Body | None] = [None] * BODIES
         self._cell = ASSUMED_CELL
+        self.restless = np.zeros(BODIES, bool)
         self._recorder = Recorder(self._data, self.config.trace_every)
 
     @property
@@ -200,8 +203,14 @@ class NativeWorld:
         """Whether both fingers press on the target, and whether it is outside the shelf."""
         return self._holds(TARGET), bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
 
+    def touching(self) -> list[Touch]:
+        """What the bodies touch where they are."""
+        mujoco.mj_forward(self._model, self._data)
+        return touches(self._model, self._data)
+
     def _record(self) -> None:
         """Begin a trace."""
+        self.restless[:] = False
         self._recorder = Recorder(self._data, self.config.trace_every)
 
     def _target_lies(self) -> bool:
@@ -296,15 +305,14 @@ class NativeWorld:
         block = round(self.config.settle_block * self.config.motion.timestep / self._model.opt.timestep)
         hold = np.tile(self._data.ctrl, (block, 1))
         first = 1 + self._model.nq + ROBOT
-        settled = False
         for _ in range(self.config.settle_steps // self.config.settle_block):
             states = self._run(hold)
             speed = np.abs(states[:, first : first + 6 * BODIES]).reshape(-1, BODIES, 6)
-            settled = bool((speed < limit).all())
-            if settled:
+            self.restless = ~(speed < limit).all(axis=(0, 2))
+            if not self.restless.any():
                 break
         self._data.qvel[:] = 0.0
-        return settled
+        return not self.restless.any()
 
     def _set_robot(self, q: np.ndarray, finger: float) -> None:
         fingers = np.full(2, max(finger, 0.0))
@@ -353,12 +361,23 @@ class NativeWorld:
         retrieval = self._retrieval(gone)
         self._take_over()
         failure = failure or retrieval.failure
-        return outcome_of(failure, self._recorder.steps, settled, retrieval.fallen, retrieval.held, retrieval.outside)
+        fallen, held, outside = retrieval.fallen, retrieval.held, retrieval.outside
+        return outcome_of(
+            failure,
+            self._recorder.steps,
+            settled,
+            fallen,
+            self.restless & (failure is not Failure.UNSTABLE),
+            held,
+            outside,
+        )
 
     def _finish(self, failure: Failure, settled: bool) -> Outcome:
         """Say what became of anything else."""
         self._take_over()
-        return outcome_of(failure, self._recorder.steps, settled, self._fallen())
+        return outcome_of(
+            failure, self._recorder.steps, settled, self._fallen(), self.restless & (failure is not Failure.UNSTABLE)
+        )
 
     def _take_over(self) -> None:
         """Take the world over from the simulation, if anything was simulated."""
@@ -371,22 +390,6 @@ class NativeWorld:
             position=jnp.where(valid[:, None], jnp.asarray(poses[:, :3], jnp.float32), self.world.position),
             rotation=jnp.where(valid[:, None, None], jnp.asarray(rotation, jnp.float32), self.world.rotation),
         )
-
-
-def outcome_of(
-    failure: Failure, steps: int, settled: bool, fallen: np.ndarray, held: bool = False, outside: bool = False
-) -> Outcome:
-    return Outcome(
-        failure=jnp.int32(failure),
-        steps=jnp.int32(steps),
-        settled=jnp.array(settled),
-        fallen=jnp.asarray(fallen),
-        held=jnp.array(held),
-        outside=jnp.array(outside),
-        retrieved=jnp.array(held and failure is Failure.NONE),
-        overflow=jnp.int32(0),
-        tracking_error=jnp.float32(0.0),
-    )
 
 
 class _Retrieval(NamedTuple):

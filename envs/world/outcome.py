@@ -7,6 +7,10 @@ import enum
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from mechsearch_jax.envs.world.world import BODIES
 
 
 class Failure(enum.IntEnum):
@@ -63,6 +67,7 @@ class Outcome(flax.struct.PyTreeNode):
       failure: a `Failure`, int32.
       steps: simulated time steps, int32; 0 if the action was out of reach or none.
       settled: whether everything came to rest within `SimulatorConfig.settle_steps`; what had not was stopped.
+      restless: which bodies did not, the target last, shape (..., 9).
       fallen: which bodies are off the board, since this action or before, the target last, shape (..., 9); never a
         target in the hand.
       held: after a retrieval, whether the target is between the closed fingers; else False.
@@ -75,6 +80,7 @@ class Outcome(flax.struct.PyTreeNode):
     failure: jax.Array
     steps: jax.Array
     settled: jax.Array
+    restless: jax.Array
     fallen: jax.Array
     held: jax.Array
     outside: jax.Array
@@ -91,3 +97,27 @@ class Outcome(flax.struct.PyTreeNode):
     def reason(self, i: int | tuple[int, ...] = ()) -> str | None:
         """Why the action failed, in a few words, or None; `i` indexes a batch."""
         return Failure(int(self.failure[i])).text
+
+
+def outcome_of(
+    failure: Failure,
+    steps: int,
+    settled: bool,
+    fallen: Bool[np.ndarray, " 9"],
+    restless: Bool[np.ndarray, " 9"] | None = None,
+    held: bool = False,
+    outside: bool = False,
+) -> Outcome:
+    """The outcome of a single action, without a tracking error; no body is restless by default."""
+    return Outcome(
+        failure=jnp.int32(failure),
+        steps=jnp.int32(steps),
+        settled=jnp.array(settled),
+        restless=jnp.asarray(np.zeros(BODIES, bool) if restless is None else restless),
+        fallen=jnp.asarray(fallen),
+        held=jnp.array(held),
+        outside=jnp.array(outside),
+        retrieved=jnp.array(held and failure is Failure.NONE),
+        overflow=jnp.int32(0),
+        tracking_error=jnp.float32(0.0),
+    )

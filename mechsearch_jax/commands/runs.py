@@ -242,6 +242,7 @@ def run_episodes_of(
     """
     from mechsearch_jax.benchmarks.report.episode_tables import print_rates
     from mechsearch_jax.benchmarks.running.evaluate import make_jobs
+    from mechsearch_jax.envs.scenes.standing import check_standing
 
     engine = run.engine(command, points[0])
     # Several points may give the same settings.
@@ -254,6 +255,7 @@ def run_episodes_of(
         print_estimate(command, planned, out, run, points[0].simulator)
         return
     jobs = make_jobs(find_scenarios(scenarios), methods, seeds)
+    check_standing({job.path: job.scenario for job in jobs}, methods[0].workcell.shelf)
     run_jobs(command, jobs, out, run, points[0].simulator, print_rates)
 
 

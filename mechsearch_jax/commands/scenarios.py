@@ -107,23 +107,29 @@ def _generate_set(name: str, out: Path) -> int:
 
 
 def check(scenarios: Scenarios, /, *, config: ConfigFile = None) -> None:
-    """Check scenario files; every one that is malformed is named with its reason.
+    """Check scenario files: what is malformed, and bodies that cannot stand where they are, are named with the reason.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       config: a file of settings, of which the shelf counts.
     """
+    from mechsearch_jax.envs.scenes.standing import faults
+    from mechsearch_jax.envs.simulators.native_world import NativeWorld
     from mechsearch_jax.workspace.scenario import load_scenario
+    from mechsearch_jax.workspace.shelf import Shelf
 
-    shelf = None if config is None else settings_of(config).workcell.shelf
-    bad = 0
+    shelf = Shelf() if config is None else settings_of(config).workcell.shelf
+    world, bad = NativeWorld(shelf), 0
     for file in find_scenarios(scenarios):
         try:
             scenario = load_scenario(file, shelf)
+            wrong = [f"{file}: {fault}" for fault in faults(scenario, world)]
         except InputError as error:
-            print(error, file=sys.stderr)
-            bad += 1
-        else:
+            wrong = [str(error)]
+        for line in wrong:
+            print(line, file=sys.stderr)
+        bad += bool(wrong)
+        if not wrong:
             print(f"{file}: {len(scenario.objects)} objects, target {scenario.target.shape}")
     if bad:
         raise SystemExit(2)

@@ -239,9 +239,12 @@ def _scene(
       InputError: a file cannot be used; that of a target raises it in the function.
     """
     from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+    from mechsearch_jax.envs.scenes.standing import check_standing
     from mechsearch_jax.workspace.scenario import load_scenario
 
     if scenario is not None:
-        loaded = load_scenario(find_scenario(scenario), shelf)
+        file = find_scenario(scenario)
+        loaded = load_scenario(file, shelf)
+        check_standing({str(file): loaded}, shelf)
         return lambda: loaded
     return lambda: ScenarioGenerator.of(settings, generated.hides.load()).generate(seed, generated.objects or 0)
