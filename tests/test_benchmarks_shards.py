@@ -15,7 +15,7 @@ import pytest
 from mechsearch_jax.benchmarks.report.report import read_tables
 from mechsearch_jax.benchmarks.store import claims as claiming
 from mechsearch_jax.benchmarks.store.claims import CLAIMS, Claims
-from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, write_rows
+from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, parse_row, read_rows, write_rows
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
 from mechsearch_jax.runtime.errors import InputError
 
@@ -188,6 +188,18 @@ def test_what_was_open_as_its_machine_went_down_is_closed_once_it_is_old(tmp_pat
         claims.close_what_is_left()
     assert open_shards(tmp_path) == []
     assert len(list(tmp_path.glob("*.parquet"))) == 1
+
+
+def test_rows_of_before_decisions_had_a_number_are_read(tmp_path):
+    numbered = [dataclasses.replace(row, decision_version=3) for row in ROWS[:2]]
+    write_rows(numbered, tmp_path / "new.parquet")
+    assert read_rows(tmp_path / "new.parquet") == numbered
+    old = pyarrow.parquet.read_table(tmp_path / "new.parquet").drop_columns("decision_version")
+    pyarrow.parquet.write_table(old, tmp_path / "old.parquet")
+    assert read_rows(tmp_path / "old.parquet") == ROWS[:2]
+    fields = {name: value for name, value in vars(numbered[0]).items() if name != "decision_version"}
+    assert parse_row(json.dumps(fields)) == ROWS[0]
+    assert parse_row(json.dumps(vars(numbered[0]))) == numbered[0]
 
 
 def test_an_episode_is_taken_once(tmp_path):

@@ -19,6 +19,7 @@ from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.versions import DECISION_VERSION, DECISIONS
 
 # The stages of a step that the robot spends thinking; simulation is another.
 PLANNING = ("recognise", "believe", "grasp", "plan", "judge")
@@ -89,6 +90,7 @@ class Row:
       code: what ran it, as `evaluate.present_code` says it.
       device: that computed it, as `versions` says it.
       versions: of Python and the libraries, and the machine, as JSON.
+      decision_version: the `DECISION_VERSION` of `runtime.versions` that it ran with; None in rows that are older.
 
     From `looks` to `unsettled`, `compile_seconds`, `device` and `versions` are None for an episode that could not be
     run to its end.
@@ -127,12 +129,14 @@ class Row:
     code: str = ""
     device: str | None = None
     versions: str | None = None
+    decision_version: int | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode, code: str = "") -> Row:
         """The row of an episode that ran to its end, by the code that ran it."""
         spent = [{"simulate": 0.0, **step.timings} for step in episode.steps]
-        libraries = {name: version for name, version in episode.versions.items() if name != "device"}
+        libraries = {name: version for name, version in episode.versions.items() if name not in ("device", DECISIONS)}
+        decisions = episode.versions.get(DECISIONS)
         return cls(
             scenario=episode.scenario,
             objects=episode.objects,
@@ -152,6 +156,7 @@ class Row:
             code=code,
             device=episode.versions.get("device"),
             versions=json.dumps(libraries, sort_keys=True),
+            decision_version=None if decisions is None else int(decisions),
         )
 
     @classmethod
@@ -171,6 +176,7 @@ class Row:
             content_hash=scenario.content_hash,
             paper_graspable=False,
             code=code,
+            decision_version=DECISION_VERSION,
         )
 
     @property
@@ -219,6 +225,8 @@ def _column(kind: Any) -> pyarrow.DataType:
 
 
 _FIELDS = {name: _column(kind) for name, kind in get_type_hints(Row).items()}
+# Columns that earlier versions did not have; null in their rows.
+_LATER = {"decision_version"}
 # The same in rows of the same episode, whichever table they are in.
 EPISODE = "episode"
 # Columns for who reads the table with something else; a row has all of it in its other fields.
@@ -303,13 +311,13 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
-    missing = _FIELDS.keys() - set(table.schema.names)
+    missing = _FIELDS.keys() - _LATER - set(table.schema.names)
     if missing:
         raise InputError(
             f"{path}: lacks the column {min(missing)}: it is no table of episodes of this version; use another file"
         )
     try:
-        columns = table.select(list(_FIELDS)).to_pydict()
+        columns = table.select([name for name in _FIELDS if name in table.schema.names]).to_pydict()
         return [_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
     except ValueError as error:
         raise InputError(f"{path}: {error}; use another file") from error
@@ -324,10 +332,10 @@ def parse_row(text: str | bytes) -> Row:
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("it is not a JSON object")
-    missing = _FIELDS.keys() - value.keys()
+    missing = _FIELDS.keys() - _LATER - value.keys()
     if missing:
         raise ValueError(f"it lacks {min(missing)}")
-    return _row({name: value[name] for name in _FIELDS})
+    return _row({name: value[name] for name in _FIELDS if name in value})
 
 
 def _row(fields: dict[str, Any]) -> Row:
