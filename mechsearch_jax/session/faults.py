@@ -10,6 +10,7 @@ import numpy as np
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.overlaps import overlap_faults
@@ -23,6 +24,7 @@ from mechsearch_jax.perception.plausibility import (
 )
 from mechsearch_jax.perception.recogniser import Recogniser, Setting, check_images
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.sight import camera_faults
 
@@ -68,10 +70,44 @@ def image_warnings(setting: Setting, recogniser: Any, images: Images, observatio
     return faults
 
 
+def checked(observation: Observation) -> Observation:
+    """What a recogniser returned, as the rest of the library reads it.
+
+    Raises:
+      InputError: an object is no superquadric.
+    """
+    objects = observation.objects
+    levels = (objects,) if objects.parts is None else (objects, objects.parts)
+    for level in levels:
+        size, exponents, valid = (np.asarray(a) for a in (level.size, level.exponents, level.valid))
+        wrong = ~((size > 0) & np.isfinite(size)).all(axis=-1) | ~((exponents > 0) & (exponents <= 2)).all(axis=-1)
+        if (wrong & valid).any():
+            where = np.argwhere(wrong & valid)[0]
+            raise InputError(
+                f"recogniser: object {where[0]} has half-extents {size[tuple(where)].tolist()} and exponents "
+                f"{exponents[tuple(where)].tolist()}; the former must be positive, the latter above 0 and at most 2"
+            )
+    return observation.with_boxes()
+
+
+def shape_warnings(observation: Observation) -> list[str]:
+    """Warnings about objects that are neither boxes nor round: plans take them for the latter."""
+    faults = []
+    for i in np.flatnonzero(np.asarray(observation.objects.valid)):
+        e1, e2 = np.asarray(observation.objects.exponents[i], float)
+        if max(e1, e2) > 2.0 - ROUND_EXPONENT:
+            faults.append(
+                f"object {i}: exponents {e1:.2f} and {e2:.2f} are of a body that comes to a point or a ridge; it is "
+                "planned as the box or the round body around it, so look whether the recogniser's fit is right"
+            )
+    return faults
+
+
 def recognition_warnings(setting: Setting, depth: np.ndarray, observation: Observation) -> list[str]:
     """Warnings about what is recognised: nothing, too much, or objects in each other."""
     unseen = sight_faults(setting.camera, setting.shelf, depth, observation)
-    return [*unseen, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
+    of_shapes = [*_crowd_warnings(observation), *shape_warnings(observation)]
+    return [*unseen, *of_shapes, *overlap_faults(setting, observation)]
 
 
 def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:
