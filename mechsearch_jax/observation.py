@@ -5,8 +5,11 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
-from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics, as_boxes
+from mechsearch_jax.runtime.compiled import kept
 
 
 class Observation(flax.struct.PyTreeNode):
@@ -33,3 +36,20 @@ class Observation(flax.struct.PyTreeNode):
         if self.confidence is not None:
             return self
         return self.replace(confidence=jnp.asarray(self.objects.valid).astype(jnp.float32))
+
+    def with_boxes(self) -> Observation:
+        """The same observation with every box described as one; see `superquadric.as_boxes`. Whatever reads an
+        observation that somebody else made begins with it."""
+        # Nearly always there is nothing to do, which outside of transformations needs no program.
+        return self.replace(objects=_with_boxes(self.objects)) if _may_turn(self.objects) else self
+
+
+def _may_turn(objects: Superquadrics) -> bool:
+    """Whether a box may be described otherwise; True where that is not known yet."""
+    described = objects.exponents if objects.parts is None else objects.parts.exponents
+    return isinstance(described, Tracer) or bool(np.any(np.asarray(described)[..., 1] > 2.0 - ROUND_EXPONENT))
+
+
+@kept()
+def _with_boxes(objects: Superquadrics) -> Superquadrics:
+    return as_boxes(objects)

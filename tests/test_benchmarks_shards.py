@@ -1,6 +1,7 @@
 """Results as a folder: whoever adds to it and whatever is killed, each episode counts once and none is missing."""
 
 import dataclasses
+import errno
 import json
 import os
 import subprocess
@@ -8,12 +9,13 @@ import sys
 import time
 
 import pyarrow.dataset
+import pyarrow.parquet
 import pytest
 
 from mechsearch_jax.benchmarks.report.report import read_tables
 from mechsearch_jax.benchmarks.store import claims as claiming
 from mechsearch_jax.benchmarks.store.claims import CLAIMS, Claims
-from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, write_rows
+from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, parse_row, read_rows, write_rows
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
 from mechsearch_jax.runtime.errors import InputError
 
@@ -132,6 +134,72 @@ def test_folders_of_folders_and_files_are_reported_together(tmp_path):
     write_rows(ROWS[:1], tmp_path / "twice.parquet")
     with pytest.raises(InputError, match=r"twice\.parquet: holds scenario 'a', seed 0, .*one by one"):
         read_tables([tmp_path / "all", tmp_path / "twice.parquet"])
+
+
+def full_disk(table, file, **options):
+    file.write(b"half")
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_what_an_error_left_open_is_closed_by_who_comes_next(tmp_path, monkeypatch):
+    with Claims(tmp_path) as claims:
+        writer = ShardWriter(tmp_path, claims.owner)
+        writer.append(ROWS[:3])
+        monkeypatch.setattr(pyarrow.parquet, "write_table", full_disk)
+        with pytest.raises(InputError, match=r"\.parquet: cannot be written \(No space left .*; the rows are kept in "):
+            writer.close()
+    # Nothing half is left, and nothing is lost.
+    assert [path.name for path in tmp_path.iterdir()] == [OPEN]
+    assert read(tmp_path) == ROWS[:3]
+    monkeypatch.undo()
+    with Claims(tmp_path) as claims, ShardWriter(tmp_path, claims.owner) as writer:
+        # Of one that is at work, nothing is touched.
+        with Claims(tmp_path) as other, ShardWriter(tmp_path, other.owner) as others:
+            others.append(ROWS[3:4])
+            claims.close_what_is_left()
+            assert len(open_shards(tmp_path)) == 1
+        writer.append(ROWS[4:5])
+    assert open_shards(tmp_path) == []
+    assert sorted(pyarrow.dataset.dataset(tmp_path).to_table().column("seed").to_pylist()) == list(range(5))
+    assert read(tmp_path) == ROWS[:5]
+
+
+def test_after_a_shard_could_not_be_closed_its_writer_goes_on_in_another(tmp_path, monkeypatch):
+    with ShardWriter(tmp_path, "me", rows_per_shard=2) as writer:
+        monkeypatch.setattr(pyarrow.parquet, "write_table", full_disk)
+        with pytest.raises(InputError, match="No space left"):
+            writer.append(ROWS[:2])
+        monkeypatch.undo()
+        writer.append(ROWS[2:3])
+    assert open_shards(tmp_path) == ["shard-me-00000.jsonl"]
+    assert read(tmp_path) == ROWS[:3]
+
+
+def test_what_was_open_as_its_machine_went_down_is_closed_once_it_is_old(tmp_path, monkeypatch):
+    with monkeypatch.context() as before:
+        before.setattr(claiming, "_machine", lambda: "this machine, before")
+        gone = Claims(tmp_path)
+        ShardWriter(tmp_path, gone.owner).append(ROWS[:3])
+    with Claims(tmp_path) as claims:
+        claims.close_what_is_left()
+        assert len(open_shards(tmp_path)) == 1
+        ago = time.time() - 2 * claiming.OLD
+        os.utime(tmp_path / OPEN / f"{gone.owner}.owner", (ago, ago))
+        claims.close_what_is_left()
+    assert open_shards(tmp_path) == []
+    assert len(list(tmp_path.glob("*.parquet"))) == 1
+
+
+def test_rows_of_before_decisions_had_a_number_are_read(tmp_path):
+    numbered = [dataclasses.replace(row, decision_version=3) for row in ROWS[:2]]
+    write_rows(numbered, tmp_path / "new.parquet")
+    assert read_rows(tmp_path / "new.parquet") == numbered
+    old = pyarrow.parquet.read_table(tmp_path / "new.parquet").drop_columns("decision_version")
+    pyarrow.parquet.write_table(old, tmp_path / "old.parquet")
+    assert read_rows(tmp_path / "old.parquet") == ROWS[:2]
+    fields = {name: value for name, value in vars(numbered[0]).items() if name != "decision_version"}
+    assert parse_row(json.dumps(fields)) == ROWS[0]
+    assert parse_row(json.dumps(vars(numbered[0]))) == numbered[0]
 
 
 def test_an_episode_is_taken_once(tmp_path):

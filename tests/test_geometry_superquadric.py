@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.geometry.footprints import footprints
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 
@@ -147,3 +148,62 @@ def test_padding_keeps_the_objects_and_refuses_too_many():
     np.testing.assert_array_equal(padded.size[:3], scene.size)
     with pytest.raises(InputError, match="3 objects do not fit a capacity of 2"):
         superquadric.pad(scene, 2)
+
+
+def four(e2, size=(0.04, 0.04, 0.06), rotation=((0.0, -1.0, 0.0), (0.8, 0.0, -0.6), (0.6, 0.0, 0.8))):
+    """Four of the same superquadric, tilted, in a world."""
+    one = superquadric.Superquadrics(
+        jnp.float32(size), jnp.float32([0.3, e2]), jnp.float32([0.5, 0.1, 0.4]), jnp.float32(rotation), jnp.array(True)
+    )
+    return jax.tree.map(lambda a: jnp.stack([a] * 4), one)
+
+
+@pytest.mark.parametrize("e2", [1.45, 1.7, 1.9, 2.0])
+def test_a_box_described_as_turned_by_an_eighth_is_described_as_a_box(e2):
+    scene = four(e2)
+    boxes = superquadric.as_boxes(scene)
+    assert np.all(boxes.exponents[:, 1] <= superquadric.ROUND_EXPONENT)
+    # It is one thing: its faces and edges are where they were.
+    directions = jnp.float32([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1], [3, 1, 0]])
+    points = scene.position[:1] + 0.05 * transforms.rotate(scene.rotation[:1], directions)
+
+    def gauge(s):
+        return superquadric.gauge(s.size[None], s.exponents[None], superquadric.to_object_frame(s, points))
+
+    before, after = gauge(scene), gauge(boxes)
+    np.testing.assert_allclose(after[:5], before[:5], rtol=0.08)
+    np.testing.assert_allclose(after[5], before[5], rtol=0.1)
+    np.testing.assert_allclose(
+        boxes.rotation @ jnp.swapaxes(boxes.rotation, 1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-6
+    )
+    again = superquadric.as_boxes(boxes)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(boxes), strict=True))
+
+
+def test_the_square_block_of_another_fit_is_the_same_block():
+    half, turn = 0.03, 0.5**0.5
+    yaw = ((turn, -turn, 0.0), (turn, turn, 0.0), (0.0, 0.0, 1.0))
+    box = superquadric.as_boxes(four(1.9, (half * 2**0.5, half * 2**0.5, 0.06), yaw))
+    np.testing.assert_allclose(box.size[0], (half, half, 0.06), atol=0.0012)
+    np.testing.assert_allclose(np.abs(box.rotation[0]), np.eye(3)[[1, 0, 2]], atol=1e-6)
+    assert not np.any(footprints(box).round)
+    assert np.all(footprints(four(1.0, rotation=yaw)).round)
+
+
+BLOCK, SLAB = (0.04, 0.04, 0.06), (0.05, 0.03, 0.06)
+
+
+@pytest.mark.parametrize(("e2", "size"), [(0.1, BLOCK), (1.0, BLOCK), (1.4, BLOCK), (1.9, SLAB)])
+def test_all_else_is_as_it_was_to_the_bit(e2, size):
+    scene = four(e2, size)
+    same = superquadric.as_boxes(scene)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(scene), strict=True))
+
+
+def test_the_parts_of_a_body_are_described_as_boxes():
+    whole = four(1.0)
+    parts = jax.tree.map(lambda a: jnp.stack([a] * 2), four(1.9))
+    parts = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), parts)
+    body = superquadric.as_boxes(whole.replace(parts=parts))
+    assert np.all(body.parts.exponents[..., 1] < 0.5)
+    np.testing.assert_array_equal(body.size, whole.size)

@@ -351,6 +351,12 @@ def test_points_are_selected_evenly():
 
 
 def test_configurations_refuse_what_makes_no_sense():
-    for wrong in ({"points": 0}, {"noise": -1.0}, {"stages": ()}, {"hypotheses": ((0.0, 1.0, 0.0),)}):
+    for wrong in (
+        {"points": 0},
+        {"noise": -1.0},
+        {"stages": ()},
+        {"hypotheses": ((0.0, 1.0, 0.0),)},
+        {"hypotheses": ((0.2, 1.9, 0.0),)},
+    ):
         with pytest.raises(InputError):
             RefinementConfig(**wrong)

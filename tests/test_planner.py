@@ -77,6 +77,28 @@ def root(decision, problem):
     return begin(problem, belief, objects)
 
 
+def test_a_block_is_moved_alike_however_a_fit_describes_it(problem):
+    decided = []
+    for e2, half, yaw in ((0.2, 0.03, 0.0), (1.9, 0.03 * 2**0.5, np.pi / 4)):
+        c, s = np.cos(yaw), np.sin(yaw)
+        block = superquadric.Superquadrics(
+            size=jnp.float32([[half, half, 0.06]]),
+            exponents=jnp.float32([[0.2, e2]]),
+            position=jnp.float32([[0.58, 0.1, 0.4645]]),
+            rotation=jnp.float32([[[c, -s, 0], [s, c, 0], [0, 0, 1]]]),
+            valid=jnp.ones(1, bool),
+        )
+        objects = superquadric.pad(block, 8)
+        belief = look(problem, objects)
+        decided.append((belief, POLICY(jax.random.key(0), problem, belief, seen(objects))))
+    (_, box), (_, turned) = decided
+    assert int(box.action.kind) == int(turned.action.kind) == ActionKind.PICK_AND_PLACE
+    kinds = [set(np.unique(decision.sequences.actions.kind[:, 0]).tolist()) for _, decision in decided]
+    assert kinds[0] == kinds[1]
+    allowed = [int(jnp.sum(belief.exists)) for belief, _ in decided]
+    assert abs(allowed[0] - allowed[1]) <= 0.05 * allowed[0]
+
+
 def test_the_default_is_the_preset_standard_field_by_field():
     assert planner.standard() == planner.Config()
     assert planner.standard().options() == {

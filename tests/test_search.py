@@ -38,6 +38,7 @@ from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session import faults
 from mechsearch_jax.session.faults import check_image, recognition_warnings
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.session.searcher import DRAWS, Searcher
@@ -577,3 +578,34 @@ def test_images_that_show_nothing_are_reported():
         image_faults(Look(CAMERA, SHELF, np.zeros_like(IMAGES.depth)))
     (fault,) = image_faults(Look(CAMERA, SHELF, IMAGES.depth, mask=np.full_like(IMAGES.mask, -1)))
     assert "names no object" in fault
+
+
+def described(e1, e2, half=(0.03, 0.03, 0.06)):
+    """What a recogniser returns of one object."""
+    objects = empty(2)
+    return Observation(
+        objects.replace(
+            size=objects.size.at[0].set(jnp.float32(half)),
+            exponents=objects.exponents.at[0].set(jnp.float32([e1, e2])),
+            valid=jnp.array([True, False]),
+        ),
+        jnp.array(False),
+        jnp.zeros(3),
+    )
+
+
+def test_what_a_recogniser_describes_is_taken_for_what_it_is():
+    seen = faults.checked(described(0.2, 1.9))
+    assert seen.objects.exponents[0, 1] < 0.5
+    assert faults.shape_warnings(seen) == faults.shape_warnings(described(0.2, 1.2)) == []
+    for strange in (described(1.9, 1.0), described(0.2, 1.9, (0.05, 0.03, 0.06))):
+        (warning,) = faults.shape_warnings(faults.checked(strange))
+        assert "object 0: exponents" in warning
+    for wrong in (
+        described(0.2, 2.1),
+        described(0.0, 1.0),
+        described(0.2, jnp.nan),
+        described(0.2, 0.2, (0.03, 0.0, 0.1)),
+    ):
+        with pytest.raises(InputError, match=r"recogniser: object 0 has half-extents .* exponents"):
+            faults.checked(wrong)

@@ -3,7 +3,8 @@
 A process takes an episode by making a file of its name, which can be done only once. The file names its owner, and is
 removed when the episode's row is there. Each owner keeps a file of its own locked and touches it every now and then.
 What an owner took is free again when it is gone: on this machine that is when nothing holds the lock, at once after a
-kill; elsewhere, when its file has not been touched for `SILENCE` seconds by this process's clock, since clocks differ.
+kill; elsewhere, and after this machine was started anew, when its file has not been touched for `SILENCE` seconds by
+this process's clock, since clocks differ, or is older than they ever differ (`OLD`).
 
 Claims only save work. A machine that slept and wakes up may run an episode that another took from it; `shards` says
 which row counts then.
@@ -21,7 +22,7 @@ import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from mechsearch_jax.benchmarks.store.shards import OPEN, close_shards_of
+from mechsearch_jax.benchmarks.store.shards import OPEN, close_shards_of, writers_of_open_shards
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, check_writable
 
@@ -29,6 +30,8 @@ CLAIMS = "claims"
 OWNER_ENDING = ".owner"
 # How often an owner shows that it is there, and how long it may be silent [s].
 TOUCHED_EVERY, SILENCE = 10.0, 120.0
+# Age of such a sign that no difference between clocks explains [s].
+OLD = 3600.0
 
 
 def _machine() -> str:
@@ -143,17 +146,21 @@ class Claims:
                 path.unlink()
 
     def close_what_is_left(self) -> None:
-        """Close the shards of processes of this machine that were killed, and remove their claims.
+        """Close the shards of processes that are gone, and remove their claims.
+
+        Gone are those that were killed on this machine, that were silent for long, and that ended without closing their
+        shards, as on a full disk.
 
         Raises:
           InputError: a shard cannot be read or written.
         """
-        left = [path.name.removesuffix(OWNER_ENDING) for path in self._open.glob(f"*{OWNER_ENDING}")]
-        for owner in left:
-            with self._locked(owner) as locked:
-                if locked:
-                    close_shards_of(self._folder, owner)
-                    self._owner_file(owner).unlink(missing_ok=True)
+        # An owner's file is there before its first shard: a shard that is seen first and has no owner is left over.
+        writers = writers_of_open_shards(self._folder)
+        owners = {path.name.removesuffix(OWNER_ENDING) for path in self._open.glob(f"*{OWNER_ENDING}")}
+        for owner in sorted(writers | owners):
+            if self._is_gone(owner):
+                close_shards_of(self._folder, owner)
+                self._owner_file(owner).unlink(missing_ok=True)
         for claim in self._claims.iterdir():
             self.is_free(claim.name)
 
@@ -209,7 +216,9 @@ class Claims:
             return locked or self._is_silent(owner, touched)
 
     def _is_silent(self, name: str, touched: int) -> bool:
-        """Whether something has not been touched for long, as far as this process has seen."""
+        """Whether something has not been touched for long, as far as this process has seen or the file says."""
+        if time.time() - touched / 1e9 > OLD:
+            return True
         now = time.monotonic()
         before, since = self._seen.setdefault(name, (touched, now))
         if before != touched:

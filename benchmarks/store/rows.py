@@ -19,6 +19,7 @@ from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.versions import DECISION_VERSION, DECISIONS
 
 # The stages of a step that the robot spends thinking; simulation is another.
 PLANNING = ("recognise", "believe", "grasp", "plan", "judge")
@@ -96,6 +97,7 @@ class Row:
         eight cells around it; None where that is not known.
       truth_ruled_out_step: number of actions before the first of these; None where there was none.
       blind_actions: number of actions that swept space of which nothing was measured.
+      decision_version: the `DECISION_VERSION` of `runtime.versions` that it ran with; None in rows that are older.
 
     From `looks` to `unsettled`, `compile_seconds`, `device`, `versions` and the last two are None for an episode that
     could not be run to its end.
@@ -137,12 +139,14 @@ class Row:
     truth_ruled_out: int | None = None
     truth_ruled_out_step: int | None = None
     blind_actions: int | None = None
+    decision_version: int | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode, code: str = "") -> Row:
         """The row of an episode that ran to its end, by the code that ran it."""
         spent = [{"simulate": 0.0, **step.timings} for step in episode.steps]
-        libraries = {name: version for name, version in episode.versions.items() if name != "device"}
+        libraries = {name: version for name, version in episode.versions.items() if name not in ("device", DECISIONS)}
+        decisions = episode.versions.get(DECISIONS)
         return cls(
             scenario=episode.scenario,
             objects=episode.objects,
@@ -162,6 +166,7 @@ class Row:
             code=code,
             device=episode.versions.get("device"),
             versions=json.dumps(libraries, sort_keys=True),
+            decision_version=None if decisions is None else int(decisions),
         )
 
     @classmethod
@@ -181,6 +186,7 @@ class Row:
             content_hash=scenario.content_hash,
             paper_graspable=False,
             code=code,
+            decision_version=DECISION_VERSION,
         )
 
     @property
@@ -233,6 +239,8 @@ def _column(kind: Any) -> pyarrow.DataType:
 
 
 _FIELDS = {name: _column(kind) for name, kind in get_type_hints(Row).items()}
+# Columns that earlier versions did not have; null in their rows.
+_LATER = {"decision_version"}
 # The same in rows of the same episode, whichever table they are in.
 EPISODE = "episode"
 # Columns for who reads the table with something else; a row has all of it in its other fields.

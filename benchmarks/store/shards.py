@@ -2,7 +2,8 @@
 
 A shard grows as a file of JSON lines in the folder `OPEN`, and becomes a Parquet file when it is full or its writer
 ends: the Parquet file appears whole, then the other goes. Every row is on disk before `append` returns; of a line that
-a kill cut short nothing is taken. A shard that a killed process left open is closed by the next one on its machine.
+a kill cut short nothing is taken. A shard that a process left open, because it was killed or could not write the
+Parquet file, is closed by the next one that adds to the folder (see `claims`).
 
 Two processes may have run the same episode all the same, since nothing that machines share but a folder can rule that
 out. Readers take one row of each: one without an error goes before one with an error, then the one that comes first by
@@ -198,15 +199,19 @@ class ShardWriter:
         """Close the shard that is open, if any; the next row opens another.
 
         Raises:
-          InputError: it cannot be written.
+          InputError: it cannot be written; its rows stay where they are, for the next process to close.
         """
         if self._file is None:
             return
         self._file.close()
-        self._file = None
-        close_shard(self._folder, self._name, self._rows)
-        self._number += 1
-        self._rows = []
+        name, rows = self._name, self._rows
+        self._file, self._rows, self._number = None, [], self._number + 1
+        try:
+            close_shard(self._folder, name, rows)
+        except InputError as error:
+            raise InputError(
+                f"{error}; the rows are kept in {self._folder / OPEN} until the same command is run again"
+            ) from error
 
     @property
     def _name(self) -> str:
@@ -236,6 +241,15 @@ def close_shard(folder: PathLike, name: str, rows: Sequence[Row]) -> None:
     """
     write_rows(rows, Path(folder) / f"{name}{CLOSED_ENDING}")
     (Path(folder) / OPEN / f"{name}{OPEN_ENDING}").unlink(missing_ok=True)
+
+
+def writers_of_open_shards(folder: PathLike) -> set[str]:
+    """Who has shards open in a folder.
+
+    Raises:
+      InputError: the folder cannot be read.
+    """
+    return {name.removeprefix(PREFIX).rpartition("-")[0] for name in _names(Path(folder) / OPEN, OPEN_ENDING)}
 
 
 def close_shards_of(folder: PathLike, writer: str) -> None:

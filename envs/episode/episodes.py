@@ -31,6 +31,7 @@ from mechsearch_jax.envs.simulators.simulator import Prepares, Simulator, TakesC
 from mechsearch_jax.envs.world.world import World, from_scenario
 from mechsearch_jax.planner import Policy, Problem
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session.preparing import Program, prepared, program
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
@@ -46,6 +47,7 @@ def target_of(scenario: Scenario, usual: Target | None = None) -> Target:
     return (usual or Target()).like(Target.of_body(scenario.target))
 
 
+@in_own_settings
 def run_episode(
     start: Start,
     problem: Problem,
@@ -66,6 +68,7 @@ def run_episode(
     return episodes[0][1]
 
 
+@in_own_settings
 def run_episodes(
     starts: Iterable[Start],
     problem: Problem,

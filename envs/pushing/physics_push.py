@@ -29,8 +29,7 @@ from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.outcome import Overflow
 from mechsearch_jax.envs.world.world import BODIES, World
-from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
-from mechsearch_jax.geometry.superquadric import Superquadrics, pad
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics, pad
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.robot.motion import push_reference
 from mechsearch_jax.runtime.cores import cores

@@ -34,6 +34,7 @@ from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.robot_trajectory import derivatives
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -113,6 +114,7 @@ def grip_for(problem: Setting, observation: Observation | None, action: Action) 
     kind = kind_of(int(action.kind))
     if observation is None or not (kind.holds_object or kind.takes_target):
         return grip_of_anything(opening)
+    observation = observation.with_boxes()
     what = grasped(problem, observation, action)
     closing = np.asarray(action.T_world_gripper, float)[:3, 1]
     objects, i = observation.objects, int(action.object)
@@ -144,6 +146,7 @@ def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[
     return kind.reference(action, config)
 
 
+@in_own_settings
 def joint_trajectory(
     problem: Setting,
     action: Action,

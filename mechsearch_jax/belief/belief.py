@@ -109,6 +109,7 @@ def update_belief(
     if (before is None) != (action is None):
         raise InputError("update_belief: give what was seen before the action and the action, or neither")
     everywhere = jnp.ones_like(belief.exists)
+    observation = observation.with_boxes()
     settings, visible = problem.config.existence, jnp.asarray(observation.target_visible)
     tables, camera, target, objects = problem.existence, problem.camera, problem.target, observation.objects
     views = object_views(tables, camera, objects, everywhere, settings)
@@ -125,7 +126,7 @@ def update_belief(
     prior = belief.exists | lost
     exists = prior
     if before is not None and action is not None and settings.reopen:
-        exists |= reopened(problem, exists, before.objects, objects, action)
+        exists |= reopened(problem, exists, before.with_boxes().objects, objects, action)
     both = exists & now
     found = (belief.found & ~lost) | visible
     contradiction = ~jnp.any(both) & ~found

@@ -35,6 +35,7 @@ from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.study import study
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
 from mechsearch_jax.runtime.errors import InputError, Note, nearest
+from mechsearch_jax.runtime.own_settings import OWN
 
 Commands = Mapping[str, Callable[..., None]]
 
@@ -174,6 +175,9 @@ def main() -> None:
     """The console command `mechsearch`."""
     # Tracing makes millions of small objects that are not garbage: looking for it takes a fifth of a start.
     gc.set_threshold(200_000, 20, 20)
+    # They are meant for other programs; so worker processes do without them, too.
+    for name in OWN:
+        os.environ.pop(name.upper(), None)
     warnings.showwarning = _noted(warnings.showwarning)
     try:
         parse(sys.argv[1:])()

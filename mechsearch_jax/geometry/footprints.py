@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.bodies import world_parts
-from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
 
-ROUND_EXPONENT = 0.6
 QUARTER_TURN = math.pi / 2
 
 Numbers = Array | np.ndarray

@@ -20,9 +20,14 @@ from jaxtyping import Array, Float
 
 from mechsearch_jax.geometry.transforms import align, inverse, make, transform
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.own_settings import in_own_settings
 
 # Exponent of the sharpest edges that the paper plans with.
 EDGE_EXPONENT = 0.2
+# An exponent e2 above it counts as round.
+ROUND_EXPONENT = 0.6
+# Largest ratio of the half-extents of a rhombus that counts as a square.
+SQUARE = 1.2
 
 
 class Superquadrics(flax.struct.PyTreeNode):
@@ -66,6 +71,7 @@ def empty(capacity: int, parts: int | None = None) -> Superquadrics:
     return absent.replace(parts=jax.tree.map(lambda a: jnp.stack([a] * parts, axis=1), absent))
 
 
+@in_own_settings
 def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
     """The same superquadrics in `capacity` slots.
 
@@ -87,6 +93,32 @@ def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
     """
     parts = None if superquadrics.parts is None else standard_edges(superquadrics.parts)
     return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, EDGE_EXPONENT), parts=parts)
+
+
+def as_boxes(superquadrics: Superquadrics) -> Superquadrics:
+    """The same superquadrics, with boxes that are described as turned by an eighth described as boxes.
+
+    An exponent e2 near 2 makes a square whose corners are on the axes: a box of exponent 2 - e2 that is turned by 45
+    degrees about its third axis. Fits return either, as in W. Liu et al., "Robust and accurate superquadric recovery: a
+    probabilistic approach", CVPR 2022. The radii along the axes and between them stay the same. All others, and rhombi
+    that are no squares, are returned to the bit. Of bodies of several parts, these are described anew.
+    """
+    if superquadrics.parts is not None:
+        return superquadrics.replace(parts=as_boxes(superquadrics.parts))
+    size, exponents, R = superquadrics.size, superquadrics.exponents, superquadrics.rotation
+    x, y, e2 = size[..., 0], size[..., 1], exponents[..., 1]
+    turned = (e2 > 2.0 - ROUND_EXPONENT) & (jnp.maximum(x, y) <= SQUARE * jnp.minimum(x, y))
+    half = 0.5 * (x + y) * jnp.exp2(0.5 * (1.0 - e2))
+    box = jnp.stack([half, half, size[..., 2]], axis=-1)
+    first, second, third = R[..., 0], R[..., 1], R[..., 2]
+    columns = jnp.stack([(first + second) * 0.5**0.5, (second - first) * 0.5**0.5, third], axis=-1)
+    # No sharper than what has such an exponent by itself.
+    mirrored = jnp.stack([exponents[..., 0], jnp.maximum(2.0 - e2, EDGE_EXPONENT)], axis=-1)
+    return superquadrics.replace(
+        size=jnp.where(turned[..., None], box, size),
+        exponents=jnp.where(turned[..., None], mirrored, exponents),
+        rotation=jnp.where(turned[..., None, None], columns, R),
+    )
 
 
 def _power(base: Array, exponent: Array) -> Array:

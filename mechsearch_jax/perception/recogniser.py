@@ -30,6 +30,7 @@ from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.own_settings import in_own_settings, own_settings
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -120,18 +121,20 @@ class Recogniser:
         """
         camera = camera or problem.camera
         check_camera(camera, problem.shelf)
-        fields = {
-            "camera": camera,
-            "view": thinned_view(camera, problem.shelf),
-            "shelf": problem.shelf,
-            "target": problem.target,
-            "segmenter": _as_pytree(segmenter or NetworkSegmenter.of()),
-            "shapes": ShapeNetwork.of(weights),
-            "detector": _as_pytree(detector or TargetColour.lit()),
-            "refinement": refinement or RefinementConfig(),
-            "fitter": fitter or Explaining(),
-            "mask_fitter": mask_fitter or as_segmented,
-        }
+        # The decorator would take this for a finished pytree.
+        with own_settings():
+            fields = {
+                "camera": camera,
+                "view": thinned_view(camera, problem.shelf),
+                "shelf": problem.shelf,
+                "target": problem.target,
+                "segmenter": _as_pytree(segmenter or NetworkSegmenter.of()),
+                "shapes": ShapeNetwork.of(weights),
+                "detector": _as_pytree(detector or TargetColour.lit()),
+                "refinement": refinement or RefinementConfig(),
+                "fitter": fitter or Explaining(),
+                "mask_fitter": mask_fitter or as_segmented,
+            }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -156,6 +159,7 @@ class Recogniser:
             object.__setattr__(made, name, value)
         return made
 
+    @in_own_settings
     def __call__(
         self,
         key: Key[Array, ""],
@@ -199,6 +203,7 @@ class Recogniser:
         fitted, visible, share = self.fitted(key, depth, colour, mask, target_id)
         return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, share)
 
+    @in_own_settings
     def fitted(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
     ) -> tuple[Fitted, Bool[Array, ""], Float[Array, "rows columns"]]:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
 from mechsearch_jax.geometry.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.perception.scores import EDGE
@@ -109,8 +109,12 @@ class RefinementConfig:
                 raise InputError(f"RefinementConfig: {field.name} ({value}) must be positive")
         if not self.stages or any(steps < 1 or scale <= 0 for steps, scale in self.stages):
             raise InputError(f"RefinementConfig: stages {self.stages} must be pairs of a number of steps and a length")
-        if any(not (0 < e1 <= 2 and 0 < e2 <= 2) for e1, e2, _ in self.hypotheses):
-            raise InputError(f"RefinementConfig: exponents in hypotheses {self.hypotheses} must be in (0, 2]")
+        most = 2.0 - ROUND_EXPONENT
+        if any(not (0 < e1 <= most and 0 < e2 <= most) for e1, e2, _ in self.hypotheses):
+            raise InputError(
+                f"RefinementConfig: exponents in hypotheses {self.hypotheses} must be above 0 and at most {most:g}; a "
+                "box of another heading has its turn for that"
+            )
 
     @classmethod
     def rough(cls, **changes: Any) -> RefinementConfig:

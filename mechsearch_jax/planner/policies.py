@@ -39,6 +39,7 @@ from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import GraspChoice, best_grasp, worth_trying
 from mechsearch_jax.runtime.compiled import Kept, kept
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.own_settings import in_own_settings
 
 
 class Policy(Protocol):
@@ -133,16 +134,19 @@ class PlanningPolicy(flax.struct.PyTreeNode):
             return problem, without_grasps(belief)
         return (problem, belief) if self.config.move_target else without_candidates(problem, belief)
 
+    @in_own_settings
     def begin(
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
     ) -> Callable[[], None] | None:
         """Lower the plan for such arguments without planning; see `runtime.compiled.Kept.begin`."""
         return _plan.begin(self._planning, key, *self._planned_with(problem, belief), observation)
 
+    @in_own_settings
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
         """Whether the plan for such arguments is compiled; see `runtime.compiled.Kept.is_ready`."""
         return _plan.is_ready(self._planning, key, *self._planned_with(problem, belief), observation)
 
+    @in_own_settings
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
         if not isinstance(belief.found, Tracer) and not belief.found:
@@ -167,24 +171,28 @@ class PlanningPolicy(flax.struct.PyTreeNode):
             grasp = grasp.replace(alternatives=planned.alternatives, sequences=planned.sequences, cost=planned.cost)
         return jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp, planned)
 
+    @in_own_settings
     def retrieval(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """Decide whether to take out a found target: an action of kind RETRIEVE, or else of kind NONE.
 
         Args:
           key, problem, belief, observation: as of a `Policy`; the key is not used.
         """
+        observation = observation.with_boxes()
         # Without a traced `found` the call is the same as elsewhere, so that nothing is compiled twice.
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
         unmeasured = {} if observation.measured is None else {"space": _space(problem, belief)}
         grasp = self.grasps(problem.target_grasps, observation.objects, belief.found_pose, *active, **unmeasured)
         return _retrieval(self, belief, observation, grasp)
 
+    @in_own_settings
     def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """Plan as if no grasp could take the target out.
 
         Args:
           key, problem, belief, observation: as of a `Policy`.
         """
+        observation = observation.with_boxes()
         decision = _plan(self._planning, key, *self._planned_with(problem, belief), observation)
         if not self.tries:
             return decision

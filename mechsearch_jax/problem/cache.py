@@ -23,6 +23,7 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import keep_in
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.kept_arrays import cache_folder, forget_old, load_arrays, save_arrays
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -53,6 +54,7 @@ def keep_compilations() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+@in_own_settings
 def cached_problem(
     target: Target | None = None,
     config: ProblemConfig | None = None,
@@ -128,7 +130,7 @@ def _source() -> str:
 def _key(parts: dict[str, Any]) -> str:
     device = jax.devices()[0]
     versions = [importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "scipy", "trimesh")]
-    key = (_source(), versions, device.platform, device.device_kind, jax.config.read("jax_enable_x64"), parts)
+    key = (_source(), versions, device.platform, device.device_kind, parts)
     return hashlib.sha256(repr(key).encode()).hexdigest()
 
 

@@ -18,6 +18,7 @@ from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.cores import on_host
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
@@ -70,6 +71,7 @@ class Problem(flax.struct.PyTreeNode):
         return TargetGrasps(self.retrieval, self.shelf, self.gripper, self.target, self.config.retrieval)
 
 
+@in_own_settings
 def build_problem(
     target: Target | None = None,
     camera: Camera | None = None,
@@ -112,6 +114,8 @@ def build_problem(
     return Problem(**tables, camera=camera, shelf=shelf, gripper=gripper, target=target, config=config)
 
 
+# In a thread of its own.
+@in_own_settings
 def _existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
     """`existence_tables` in a thread of its own, to which JAX's default device does not pass on."""
     with on_host():

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT
 from mechsearch_jax.runtime.errors import InputError, check_range, shown
 
 # Peak of the fingers' speed over its mean: they start and stop smoothly.

@@ -28,6 +28,7 @@ from jax.extend.core import get_opaque_trace_state
 from mechsearch_jax.runtime.cores import on_host
 from mechsearch_jax.runtime.executables import Executables
 from mechsearch_jax.runtime.identity import Unidentified, identity
+from mechsearch_jax.runtime.own_settings import in_own_settings
 
 # Options with which XLA compiles twice as fast for a CPU, with the same results at the same speed. Options unknown to
 # the installed XLA are left out.
@@ -114,6 +115,7 @@ class Kept:
         # Shapes of the results of what was lowered in this process.
         self._returned: dict[Hashable, Any] = {}
 
+    @in_own_settings
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         executable = self._executable(args, kwargs)
         if executable is None:
@@ -125,6 +127,7 @@ class Kept:
         """Other attributes of the jitted function, such as `lower`."""
         return getattr(self.jitted, name)
 
+    @in_own_settings
     def begin(self, *args: Any, **kwargs: Any) -> Callable[[], None] | None:
         """Lower the function for these arguments, without calling it.
 
@@ -158,6 +161,7 @@ class Kept:
 
         return finish
 
+    @in_own_settings
     def prepare(self, *args: Any, **kwargs: Any) -> None:
         """Load or compile the executable for these arguments, without calling it. May run in several threads."""
         finish = self.begin(*args, **kwargs)
@@ -176,6 +180,7 @@ class Kept:
         shapes = self._returned[key] if key in self._returned else self._loaded[key].result().out_info
         return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type), shapes)
 
+    @in_own_settings
     def is_ready(self, *args: Any, **kwargs: Any) -> bool:
         """Whether `prepare` with these arguments has nothing to compile; it may still have to read a file."""
         _KEEPING.outside()

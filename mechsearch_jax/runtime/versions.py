@@ -12,16 +12,22 @@ from pathlib import Path
 
 import jax
 
+# Raised with every change of what is decided by default, whatever the reason: recognition, belief, plan or trials. So
+# results of equal numbers belong together, and others do not. `tests/test_decision_version.py` holds it to that.
+DECISION_VERSION = 1
+# Its name among the versions.
+DECISIONS = "decisions"
 # Folders of `mechsearch_jax` that do not influence decisions, and packages that are installed beneath it.
 UNDECIDING = ("commands", "viz", "data", "envs", "train", "benchmarks")
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on, and the device."""
+    """Versions of the packages that a result depends on, of the decisions (`DECISION_VERSION`), and the device."""
     packages = ("mechsearch-jax", "jax", "mujoco", "numpy")
     device = jax.devices()[0]
     return {
         **{name: importlib.metadata.version(name) for name in packages},
+        DECISIONS: str(DECISION_VERSION),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "device": f"{device.platform}: {device.device_kind}",

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT
 from mechsearch_jax.images.checks.holes import hole_faults, unmeasured_target_faults
 from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.checks.usable import check_images
@@ -26,6 +28,7 @@ from mechsearch_jax.perception.plausibility import (
 )
 from mechsearch_jax.perception.recogniser import Recogniser, Setting
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.sight import camera_faults
 
@@ -77,8 +80,41 @@ def image_warnings(setting: Setting, recogniser: Any, look: Look, target_id: int
     return faults
 
 
+def checked(observation: Observation) -> Observation:
+    """What a recogniser returned, as the rest of the library reads it.
+
+    Raises:
+      InputError: an object is no superquadric.
+    """
+    objects = observation.objects
+    levels = (objects,) if objects.parts is None else (objects, objects.parts)
+    for level in levels:
+        size, exponents, valid = (np.asarray(a) for a in (level.size, level.exponents, level.valid))
+        wrong = ~((size > 0) & np.isfinite(size)).all(axis=-1) | ~((exponents > 0) & (exponents <= 2)).all(axis=-1)
+        if (wrong & valid).any():
+            where = np.argwhere(wrong & valid)[0]
+            raise InputError(
+                f"recogniser: object {where[0]} has half-extents {size[tuple(where)].tolist()} and exponents "
+                f"{exponents[tuple(where)].tolist()}; the former must be positive, the latter above 0 and at most 2"
+            )
+    return observation.with_boxes()
+
+
+def shape_warnings(observation: Observation) -> list[str]:
+    """Warnings about objects that are neither boxes nor round: plans take them for the latter."""
+    faults = []
+    for i in np.flatnonzero(np.asarray(observation.objects.valid)):
+        e1, e2 = np.asarray(observation.objects.exponents[i], float)
+        if max(e1, e2) > 2.0 - ROUND_EXPONENT:
+            faults.append(
+                f"object {i}: exponents {e1:.2f} and {e2:.2f} are of a body that comes to a point or a ridge; it is "
+                "planned as the box or the round body around it, so look whether the recogniser's fit is right"
+            )
+    return faults
+
+
 def recognition_warnings(setting: Setting, look: Look, observation: Observation) -> list[str]:
-    """Warnings about what is recognised: not the target, not all, too much, or objects in each other."""
+    """Warnings about what is recognised: not the target, not all, too much, odd shapes, or objects in each other."""
     other: list[str] = []
     if look.detector is not None and look.colour is not None:
         other += unmeasured_target_faults(look, observation)
@@ -86,7 +122,8 @@ def recognition_warnings(setting: Setting, look: Look, observation: Observation)
             other += detection_faults(look, observation)
     if not shows_nothing(observation):
         other += lost_faults(setting, observation, look.depth)
-    return [*other, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
+    of_shapes = [*_crowd_warnings(observation), *shape_warnings(observation)]
+    return [*other, *of_shapes, *overlap_faults(setting, observation)]
 
 
 def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:

@@ -25,6 +25,7 @@ from mechsearch_jax.planner import Policy, Problem, initial_belief, update_belie
 from mechsearch_jax.planner.policies import PlanningPolicy
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.own_settings import in_own_settings
 
 # Slots for objects in an observation.
 SLOTS = 8
@@ -152,6 +153,7 @@ class Preparing:
         with self._changed:
             self._changed.wait_for(lambda: self._awaited == 0)
 
+    @in_own_settings
     def _lower_all(self) -> None:
         while (item := self._queue.get()) is not None:
             program, optional = item

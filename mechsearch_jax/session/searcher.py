@@ -45,6 +45,7 @@ from mechsearch_jax.robot.hand import checked_width
 from mechsearch_jax.robot.motion import motion_with
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session import faults, warming
 from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.preparing import first_decision, prepared
@@ -136,11 +137,13 @@ class Searcher:
         self._state: State | None = None
 
     @functools.cached_property
+    @in_own_settings
     def problem(self) -> Problem:
         """The constants of the search; built when first needed, and kept on disk."""
         return self.workcell.problem(config=self.config.problem)
 
     @functools.cached_property
+    @in_own_settings
     def recogniser(self) -> Any:
         """The recogniser of this search."""
         if self._make_recogniser is Recogniser:
@@ -163,11 +166,13 @@ class Searcher:
         return self._now.handed
 
     @property
+    @in_own_settings
     def _now(self) -> State:
         if self._state is None:
             self._state = beginning(self.problem)
         return self._state
 
+    @in_own_settings
     def check(self) -> Check:
         """Check that the arm reaches into the shelf, the camera sees it, and the networks know such views."""
         poses = self.problem.poses.shape[0]
@@ -179,6 +184,7 @@ class Searcher:
             warnings.append(f"shelf: the arm can grasp the target at {100 * reach:.0f}% of its possible poses only")
         return Check(reach, tuple(warnings), (UNTRIED,) if tries_nothing(self._policy, self._trials) else ())
 
+    @in_own_settings
     def warm_up(
         self,
         progress: Callable[[str, int], None] = lambda what, left: None,
@@ -244,6 +250,7 @@ class Searcher:
         self.__dict__["recogniser"] = warming.fixed_recogniser(self.recogniser, observation)
         return self.next(*images)
 
+    @in_own_settings
     def next(
         self,
         depth: Any,
@@ -316,7 +323,7 @@ class Searcher:
         problem = self.problem
         look, of_images = faults.check_image(problem, self.workcell.calibration, images, self.recogniser)
         recognise = self.recogniser.unchecked if isinstance(self.recogniser, Recogniser) else self.recogniser
-        observation = recognise(key, *images).judged()
+        observation = faults.checked(recognise(key, *images)).judged()
         unseen, of_objects = sight_faults(look, observation), faults.recognition_warnings(problem, look, observation)
         return observation, [*self._view_warnings, *of_images, *unseen, *of_objects], unseen
 
@@ -404,6 +411,7 @@ class Searcher:
         )
         return motion._replace(reason=motion.reason + untried)
 
+    @in_own_settings
     def acted(self, ok: bool = True) -> None:
         """Report that the last step's motion is over, after a failure, too: the hand may have moved something unseen.
 
@@ -423,6 +431,7 @@ class Searcher:
         if self._view is not None and self._shown is not None:
             self._view.acted(self._shown, ok)
 
+    @in_own_settings
     def save(self, path: PathLike) -> None:
         """Save the search's state as an archive of arrays, .npz, so that `load` can continue it after a crash.
 
@@ -431,6 +440,7 @@ class Searcher:
         """
         save_state(self._now, self._digest, path)
 
+    @in_own_settings
     def load(self, path: PathLike) -> None:
         """Continue a search that was saved by a searcher with the same workcell, configuration and seed.
 

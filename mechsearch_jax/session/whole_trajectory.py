@@ -28,6 +28,7 @@ from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part, RobotTrajectory, derivatives
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session.placing import PlaceWay, place_ways
 from mechsearch_jax.workspace.target_view import body_at
 
@@ -75,6 +76,7 @@ class _Stage:
     way: FreeMotion | None = None
 
 
+@in_own_settings
 def whole_trajectory(
     problem: Setting,
     observation: Observation,
@@ -116,7 +118,7 @@ def whole_trajectory(
       InputError: an argument is impossible, recognition is too doubtful, the arm does not reach all of the action, or
         the way to it or home is blocked.
     """
-    config = config or TrajectoryConfig()
+    config, observation = config or TrajectoryConfig(), observation.with_boxes()
     home = np.array(HOME if home is None else home, float)
     joints = home if joints is None else np.array(joints, float)
     arm = problem.gripper.arm

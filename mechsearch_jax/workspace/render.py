@@ -13,6 +13,7 @@ from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import placed_parts, world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, rotate, transform
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 
 NEWTON_STEPS = 8
@@ -81,6 +82,7 @@ def object_depth(
     return jnp.where(scene_object.valid, depth, jnp.inf).reshape(local.shape[:-1])
 
 
+@in_own_settings
 def render_depth(camera: Camera, scene: Superquadrics) -> Float[Array, "h w"]:
     """Depth image of a scene, object by object and then the nearest.
 
