@@ -111,8 +111,7 @@ def test_commands_refuse_what_no_world_can_hold(tmp_path, capsys):
 
 def lying(tilt, x, y, half=(0.025, 0.025, 0.08), shape="cylinder"):
     """A body whose top leans to the back by an angle [rad]; the lowest point is on the board."""
-    reach = half[0] if shape == "box" else half[0]
-    height = half[2] * math.cos(tilt) + reach * math.sin(tilt)
+    height = half[2] * math.cos(tilt) + half[0] * math.sin(tilt)
     return Body(shape, half, (x, y, BOARD + height), about_y(tilt))
 
 
