@@ -231,7 +231,7 @@ def joined(hulls: Sequence[Float[np.ndarray, "_ 3"]], most: int = MOST_SOLIDS) -
     return list(left.values())
 
 
-def _true_to_size(corners: Float[np.ndarray, "n 3"], part: Trimesh) -> Float[np.ndarray, "n 3"]:
+def _true_to_size(corners: Float[np.ndarray, "n 3"], part: Trimesh) -> Float[np.ndarray, "m 3"]:
     """Corners of a piece of a part, without what remeshing has added: those outside are moved to the surface."""
     moved = np.where(turns_around(part, corners)[:, None] < 0.5, nearest(part, corners)[0], corners)
     return _corners(moved) if hull_volume(moved) else corners
