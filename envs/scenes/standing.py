@@ -96,7 +96,7 @@ def _faults(bodies: Sequence[Body | None], world: NativeWorld) -> dict[int, str]
     shift, turn = _motion(before, world.positions)
     moves = ~((shift <= SHIFT) & (turn <= TURN))
     under, beside = ({t.body for t in contacts if (t.normal[2] > STEEP) == side} for side in (True, False))
-    moves[[*under & beside]] = False
+    moves[[*(under & beside) - inside.keys()]] = False
     found = {}
     for i, body in enumerate(bodies):
         if body is None or not (i in inside or moves[i]):
