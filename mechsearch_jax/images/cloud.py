@@ -37,7 +37,7 @@ _BLOCK = 64
 _JUMP, _STEEPEST = 0.01, 0.02
 # Rounds of spreading the numbers of connected pixels; each doubles how far they reach.
 _SPREADS = 12
-# Surfaces of at least so many pixels have at least so many points in a cloud.
+# Surfaces of at least so many pixels have at least about so many points in a cloud.
 _SMALL, _LEAST = 16, 24
 
 
@@ -260,7 +260,7 @@ def resample(
       cloud: the points.
       count: how many are drawn.
       surface: the number of each point's surface, below the number of points. Of each with at least `_SMALL` points
-        `_LEAST` are drawn, as far as it has so many; without it small surfaces may be left out.
+        about `_LEAST` are drawn, as far as it has so many; without it small surfaces may be left out.
     """
     if surface is None:
         index, total = draw(key, cloud.valid, count)
