@@ -183,7 +183,7 @@ def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = 
     return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
 
 
-def numbered(down: Bool[Array, "h-1 w"], right: Bool[Array, "h w-1"]) -> Int[Array, "h w"]:
+def numbered(down: Bool[Array, "above w"], right: Bool[Array, "h before"]) -> Int[Array, "h w"]:
     """A number for each pixel, the same for connected pixels: that of one of them in the order of rows.
 
     Each round takes the least number of the neighbours, and of the pixel that has the number.
