@@ -37,7 +37,7 @@ _BLOCK = 64
 _JUMP, _STEEPEST = 0.01, 0.02
 # Rounds of spreading the numbers of connected pixels; each doubles how far they reach.
 _SPREADS = 12
-# Surfaces of at least so many pixels have at least so many points in a cloud.
+# Surfaces of at least so many pixels have at least about so many points in a cloud.
 _SMALL, _LEAST = 16, 24
 
 
@@ -183,7 +183,7 @@ def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = 
     return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
 
 
-def numbered(down: Bool[Array, "h-1 w"], right: Bool[Array, "h w-1"]) -> Int[Array, "h w"]:
+def numbered(down: Bool[Array, "above w"], right: Bool[Array, "h before"]) -> Int[Array, "h w"]:
     """A number for each pixel, the same for connected pixels: that of one of them in the order of rows.
 
     Each round takes the least number of the neighbours, and of the pixel that has the number.
@@ -260,7 +260,7 @@ def resample(
       cloud: the points.
       count: how many are drawn.
       surface: the number of each point's surface, below the number of points. Of each with at least `_SMALL` points
-        `_LEAST` are drawn, as far as it has so many; without it small surfaces may be left out.
+        about `_LEAST` are drawn, as far as it has so many; without it small surfaces may be left out.
     """
     if surface is None:
         index, total = draw(key, cloud.valid, count)

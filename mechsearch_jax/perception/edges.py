@@ -116,7 +116,7 @@ def _beyond(ends: Ends, colour: np.ndarray) -> float:
     peak = int(np.argmax(share))
     around = np.arange(max(peak - 1, 0), min(peak + 2, len(share)))
     # Most ends should have their edge at one place.
-    if share[around].sum() < 0.5 * share.sum():
+    if share[around].sum() <= 0.5 * share.sum():
         return np.nan
     return float(REACH - np.sum(around * share[around]) / share[around].sum())
 
