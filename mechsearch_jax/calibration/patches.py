@@ -97,9 +97,14 @@ def _plane_of_medians(
       inverse: depth of the pixels, NaN where not measured.
       v, u: of the pixels at unit depth.
     """
-    square, half = inverse.reshape(-1, SIDE, SIDE), SIDE // 2
-    across = _median((square[:, :, half:] - square[:, :, :half]).reshape(len(inverse), -1)) / (u[0, half] - u[0, 0])
-    down = _median((square[:, half:] - square[:, :half]).reshape(len(inverse), -1)) / (v[half, 0] - v[0, 0])
+    square = inverse.reshape(-1, SIDE, SIDE)
+
+    def slope(along: Float[np.ndarray, "n s s"], at: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n 1"]:
+        # Two distances, for a sensor may measure every second or third row or column only.
+        parts = [(along[:, by:] - along[:, :-by]) / (at[by] - at[0]) for by in (SIDE // 2 - 1, SIDE // 2)]
+        return np.nan_to_num(_median(np.concatenate(parts, axis=1).reshape(len(along), (SIDE + 1) * SIDE)))
+
+    across, down = slope(square.swapaxes(1, 2), u[0]), slope(square, v[:, 0])
     return np.hstack([across, down, _median(inverse - across * u.ravel() - down * v.ravel())])
 
 
