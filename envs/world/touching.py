@@ -29,9 +29,10 @@ _SHELF = {
     "left_plane": ("the left wall", models.MARGIN),
     "ceiling_box": ("the upper board", 0.0),
 }
-# A body whose nearest axis is farther than this from the vertical leans; a contact whose normal is nearer to it is
-# underneath [rad].
-LEANS, BELOW = math.radians(3.0), math.radians(45.0)
+# A body whose nearest axis is farther than this from the vertical leans [rad].
+LEANS = math.radians(3.0)
+# Bodies that are not farther apart than this touch, to the eye [m].
+APART = 1e-3
 
 
 class Touch(NamedTuple):
@@ -40,7 +41,7 @@ class Touch(NamedTuple):
     Attributes:
       body: its slot.
       other: what it touches: another slot, or a part of the shelf in words.
-      overlap: how far one is inside the other [m]; negative if they are apart, by no more than 1 mm.
+      overlap: how far one is inside the other [m]; negative if they are a little apart.
       normal: unit vector from the other into the body, in the world.
     """
 
@@ -93,6 +94,8 @@ def unrest(world: World, restless: Bool[np.ndarray, " 9"], shelf: Shelf, i: int)
     bodies = bodies_of(jax.tree.map(lambda leaf: leaf[i], jax.device_get(world)))
     model = models.compile_model(shelf, Camera(), compounds=models.compounds_in(bodies))
     model = models.with_bodies(model, bodies)
+    # What moves may be a little apart just now.
+    model.geom_margin += APART
     contacts = touches(model, models.initial_state(model, bodies))
     return tuple(
         f"{name_of(slot)} {_does(body, [touch for touch in contacts if touch.body == slot])}"
