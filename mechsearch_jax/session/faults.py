@@ -60,8 +60,9 @@ def image_warnings(setting: Setting, recogniser: Any, images: Images, observatio
     mask, colour = (None if image is None else np.asarray(image) for image in (images.mask, images.colour))
     faults = list(image_faults(camera, shelf, depth, mask))
     faults += [*edge_faults(camera, shelf, depth, colour), *mask_faults(camera, shelf, depth, mask)]
-    # Another recogniser may identify the target in another way.
+    # Another recogniser may identify the target in another way, and know of things that the images do not show.
     if isinstance(recogniser, Recogniser):
+        faults += lost_faults(setting, observation, depth)
         faults += identity_faults(colour, mask, target_id)
         if colour is not None and target_id is None:
             detector = recogniser.detector
@@ -74,8 +75,7 @@ def image_warnings(setting: Setting, recogniser: Any, images: Images, observatio
 def recognition_warnings(setting: Setting, depth: np.ndarray, observation: Observation) -> list[str]:
     """Warnings about what is recognised: nothing, too much, or objects in each other."""
     unseen = sight_faults(setting.camera, setting.shelf, depth, observation)
-    lost = () if unseen else lost_faults(setting, observation, depth)
-    return [*unseen, *lost, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
+    return [*unseen, *_crowd_warnings(observation), *overlap_faults(setting, observation)]
 
 
 def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:
