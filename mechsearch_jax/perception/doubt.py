@@ -199,6 +199,8 @@ def recognition_doubt(
 def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndarray, "h w"]) -> tuple[str, ...]:
     """A warning if surfaces on the shelf, large enough for an object, lie on nothing that is recognised.
 
+    Where nothing at all is recognised, `plausibility.sight_faults` says so.
+
     Args:
       setting, observation, depth: as of `recognition_doubt`.
 
@@ -206,11 +208,14 @@ def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndar
       InputError: the camera does not see the shelf.
     """
     camera, shelf = setting.camera, setting.shelf
+    things = things_of(shelf, setting.target, observation)
+    if not things:
+        return ()
     view = thinned_view(camera, shelf)
     points, standing, number = (np.asarray(a) for a in _surfaces(view, shelf, view.of(jnp.asarray(depth, jnp.float32))))
     points, number = points[standing], number[standing]
     gap = np.full(len(points), np.inf)
-    for thing in things_of(shelf, setting.target, observation):
+    for thing in things:
         gap = np.minimum(gap, thing.gap(points))
     surface = np.unique(number, return_inverse=True)[1]
     pixels = np.bincount(surface) * view.stride**2

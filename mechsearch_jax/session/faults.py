@@ -113,14 +113,15 @@ def shape_warnings(observation: Observation) -> list[str]:
     return faults
 
 
-def recognition_warnings(setting: Setting, look: Look, observation: Observation) -> list[str]:
+def recognition_warnings(setting: Setting, look: Look, observation: Observation, recogniser: Any = None) -> list[str]:
     """Warnings about what is recognised: not the target, not all, too much, odd shapes, or objects in each other."""
     other: list[str] = []
     if look.detector is not None and look.colour is not None:
         other += unmeasured_target_faults(look, observation)
         if look.mask is None:
             other += detection_faults(look, observation)
-    if not shows_nothing(observation):
+    # Another recogniser may know of things that the images do not show.
+    if isinstance(recogniser, Recogniser) and not shows_nothing(observation):
         other += lost_faults(setting, observation, look.depth)
     of_shapes = [*_crowd_warnings(observation), *shape_warnings(observation)]
     return [*other, *of_shapes, *overlap_faults(setting, observation)]

@@ -324,7 +324,8 @@ class Searcher:
         look, of_images = faults.check_image(problem, self.workcell.calibration, images, self.recogniser)
         recognise = self.recogniser.unchecked if isinstance(self.recogniser, Recogniser) else self.recogniser
         observation = faults.checked(recognise(key, *images)).judged()
-        unseen, of_objects = sight_faults(look, observation), faults.recognition_warnings(problem, look, observation)
+        unseen = sight_faults(look, observation)
+        of_objects = faults.recognition_warnings(problem, look, observation, self.recogniser)
         return observation, [*self._view_warnings, *of_images, *unseen, *of_objects], unseen
 
     def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
