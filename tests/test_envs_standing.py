@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.commands.main import main
+from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.scenes.standing import check_standing, faults
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.touching import unrest
@@ -92,7 +92,7 @@ def test_the_first_of_several_faults_is_raised_with_their_number():
         check_standing({"b.json": FIRST, "a.json": IMPOSSIBLE["in-each-other"][0]}, SHELF)
 
 
-def test_commands_refuse_what_no_world_can_hold(tmp_path, capsys):
+def test_commands_refuse_what_no_world_can_hold(tmp_path, capsys, monkeypatch):
     file = tmp_path / "sunk.json"
     save_scenario(IMPOSSIBLE["in-the-board"][0], file)
     out = tmp_path / "out"
@@ -101,8 +101,9 @@ def test_commands_refuse_what_no_world_can_hold(tmp_path, capsys):
         ["search", str(file), "--out", str(out)],
         ["evaluate", str(file), "--out", str(out)],
     ):
+        monkeypatch.setattr("sys.argv", ["mechsearch", *arguments])
         with pytest.raises(SystemExit) as stopped:
-            main(arguments)
+            cli.main()
         assert stopped.value.code == 2
         error = capsys.readouterr().err
         assert "sunk.json: objects[1]: is 5.1 mm inside the board" in error

@@ -210,7 +210,7 @@ class NativeWorld:
 
     def _record(self) -> None:
         """Begin a trace."""
-        self.restless[:] = False
+        self.restless = np.zeros(BODIES, bool)
         self._recorder = Recorder(self._data, self.config.trace_every)
 
     def _target_lies(self) -> bool:
@@ -361,23 +361,13 @@ class NativeWorld:
         retrieval = self._retrieval(gone)
         self._take_over()
         failure = failure or retrieval.failure
-        fallen, held, outside = retrieval.fallen, retrieval.held, retrieval.outside
-        return outcome_of(
-            failure,
-            self._recorder.steps,
-            settled,
-            fallen,
-            self.restless & (failure is not Failure.UNSTABLE),
-            held,
-            outside,
-        )
+        how = retrieval.fallen, self.restless, retrieval.held, retrieval.outside
+        return outcome_of(failure, self._recorder.steps, settled, *how)
 
     def _finish(self, failure: Failure, settled: bool) -> Outcome:
         """Say what became of anything else."""
         self._take_over()
-        return outcome_of(
-            failure, self._recorder.steps, settled, self._fallen(), self.restless & (failure is not Failure.UNSTABLE)
-        )
+        return outcome_of(failure, self._recorder.steps, settled, self._fallen(), self.restless)
 
     def _take_over(self) -> None:
         """Take the world over from the simulation, if anything was simulated."""

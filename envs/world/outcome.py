@@ -108,12 +108,15 @@ def outcome_of(
     held: bool = False,
     outside: bool = False,
 ) -> Outcome:
-    """The outcome of a single action, without a tracking error; no body is restless by default."""
+    """The outcome of a single action, without a tracking error; no body is restless by default, nor in a world that
+    was restored."""
+    if restless is None or failure is Failure.UNSTABLE:
+        restless = np.zeros(BODIES, bool)
     return Outcome(
         failure=jnp.int32(failure),
         steps=jnp.int32(steps),
         settled=jnp.array(settled),
-        restless=jnp.asarray(np.zeros(BODIES, bool) if restless is None else restless),
+        restless=jnp.asarray(restless),
         fallen=jnp.asarray(fallen),
         held=jnp.array(held),
         outside=jnp.array(outside),
