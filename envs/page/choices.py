@@ -23,6 +23,7 @@ from mechsearch_jax.actions import (
     widen,
 )
 from mechsearch_jax.actions.types import Candidates
+from mechsearch_jax.actions.unseen_space import BORDER, bordered
 from mechsearch_jax.config.config import OPTIONS
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording

@@ -12,7 +12,9 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-P, R, T = ParamSpec("P"), TypeVar("R"), TypeVar("T")
+P = ParamSpec("P")
+R = TypeVar("R")
+T = TypeVar("T")
 
 # JAX's defaults; the names in capitals are those of environment variables.
 OWN = {

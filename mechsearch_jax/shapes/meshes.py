@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
@@ -218,7 +218,7 @@ def joined(hulls: Sequence[Float[np.ndarray, "_ 3"]], most: int = MOST_SOLIDS) -
     gains: dict[tuple[int, int], float] = {}
     for new in range(len(left), 2 * len(left) - most):
         names = np.array(list(left))
-        tree = cKDTree([vertices.mean(axis=0) for vertices in left.values()])
+        tree = KDTree([vertices.mean(axis=0) for vertices in left.values()])
         near = names[tree.query(tree.data, k=min(NEIGHBOURS, len(names)))[1]]
         pairs = {
             (min(i, j), max(i, j)) for i, row in zip(names.tolist(), near.tolist(), strict=True) for j in row if i != j

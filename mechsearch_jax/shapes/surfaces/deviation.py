@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -50,7 +50,7 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.n
     # Small triangles may have no sample.
     around = np.concatenate([samples, mesh.triangles_center])
     of = np.concatenate([face, np.arange(len(mesh.faces))])
-    near = of[cKDTree(around).query(points, k=NEAR)[1]]
+    near = of[KDTree(around).query(points, k=NEAR)[1]]
     on = _closest(mesh, near.ravel(), np.repeat(points, NEAR, axis=0)).reshape(-1, NEAR, 3)
     apart = points[:, None] - on
     away = np.linalg.norm(apart, axis=-1)

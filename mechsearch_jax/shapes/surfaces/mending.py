@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from mechsearch_jax.shapes.compound import hull_volume
 from mechsearch_jax.shapes.surfaces.deviation import turns_around
@@ -84,7 +84,7 @@ def _welded(mesh: Trimesh) -> Trimesh:
     """The mesh without seams: other vertices than those of open edges stay, however near to each other."""
     border = np.unique(open_edges(mesh))
     if len(border):
-        pairs = border[cKDTree(mesh.vertices[border]).query_pairs(SEAM, output_type="ndarray")]
+        pairs = border[KDTree(mesh.vertices[border]).query_pairs(SEAM, output_type="ndarray")]
         same = _components(pairs, len(mesh.vertices))
         # The first vertex of each group stands for it.
         first = np.unique(same, return_index=True)[1]
