@@ -135,7 +135,9 @@ def test_a_plan_is_traced_once_for_both(two):
         candidates = all_candidates(problem.space, scene, possible)
         reached = sum(jnp.sum(kind.reached) for kind in candidates).astype(jnp.float32)
         corner = jnp.float32(problem.shelf.front)
-        return Decision(no_action(), reached, corner, possible.top, objects, no_sequences(rollout.config, objects), 0)
+        return Decision(
+            no_action(), reached, corner, jnp.max(possible.target), objects, no_sequences(rollout.config, objects), 0
+        )
 
     policy = search_for_grasp(PlannerConfig(sequences=2, horizon=1)).replace(plan=plan)
     decisions = [policy(KEY, problem, initial_belief(problem), SEEN) for problem in two]
