@@ -98,13 +98,15 @@ class Stage:
         self.executed.append([self.names[i] if active[i] else None for i in range(count)])
         outcome = Outcome(
             *(np.zeros(count, np.int32), np.ones(count, np.int32), np.ones(count, bool)),
-            *(np.zeros((count, BODIES), bool), np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)),
+            *(np.zeros((count, BODIES), bool), np.zeros((count, BODIES), bool)),
+            *(np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)),
             *(np.zeros(count, np.int32), np.full(count, 0.001, np.float32)),
         )
         for i in np.flatnonzero(active):
             name = self.names[i]
             outcome.overflow[i] = self._of("overflows", name, Overflow.NONE)
             outcome.settled[i] = not self._of("restless", name, False)
+            outcome.restless[i, 0] = not outcome.settled[i]
             if KINDS[ActionKind(int(actions.kind[i]))].takes_target:
                 outcome.failure[i] = self._of("retrievals", name, Failure.NONE)
                 outcome.retrieved[i] = outcome.failure[i] == Failure.NONE
