@@ -98,7 +98,13 @@ class Stage:
         self.executed.append([self.names[i] if active[i] else None for i in range(count)])
         outcome = Outcome(
             *(np.zeros(count, np.int32), np.ones(count, np.int32), np.ones(count, bool)),
-            *(np.zeros((count, BODIES), bool), np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)),
+            *(
+                np.zeros((count, BODIES), bool),
+                np.zeros((count, BODIES), bool),
+                np.zeros(count, bool),
+                np.zeros(count, bool),
+                np.zeros(count, bool),
+            ),
             *(np.zeros(count, np.int32), np.full(count, 0.001, np.float32)),
         )
         for i in np.flatnonzero(active):

