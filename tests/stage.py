@@ -106,7 +106,6 @@ class Stage:
             name = self.names[i]
             outcome.overflow[i] = self._of("overflows", name, Overflow.NONE)
             outcome.settled[i] = not self._of("restless", name, False)
-            outcome.restless[i, 0] = not outcome.settled[i]
             if KINDS[ActionKind(int(actions.kind[i]))].takes_target:
                 outcome.failure[i] = self._of("retrievals", name, Failure.NONE)
                 outcome.retrieved[i] = outcome.failure[i] == Failure.NONE

@@ -474,12 +474,12 @@ def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypat
 def test_friction_and_mass(problem):
     seen, at = objects_and_pose(problem, EDGE)
     aside = stack(pushes()[2])
-    # What is rough tips over, and what is rougher still may hold the hand up.
-    for friction, expected in ((1.0, DONE), (4.0, HARM), (10.0, FAILED)):
+    # What is rough holds the hand up.
+    for friction, expected in ((1.0, DONE), (4.0, FAILED)):
         assert results_of(NativeTrials(friction=friction), problem, seen, at, False, aside).tolist() == [expected]
     scenes = several(seen, seen, seen).replace(friction=np.array([1.0, 4.0, 1.0]), mass=np.array([1.0, 1.0, 30.0]))
     expected = MODEL(problem, scenes, stack(*[aside] * 3), np.ones((3, 1), bool))
-    assert expected.tolist() == [[DONE], [HARM], [HARM]]
+    assert expected.tolist() == [[DONE], [FAILED], [FAILED]]
     for wrong in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="must be a positive number"):
             NativeTrials(friction=wrong)
@@ -536,15 +536,13 @@ def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
 def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(problem, retrievals):
     over, away, aside = pushes()
     beliefs, seen = stack(look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM))
-    tried, became = retrievals["loose"]
-    chosen = np.array([int(np.argmax(became == DONE)), 0, 1])
-    grasps = jax.tree.map(lambda a: a[chosen], tried.action)
+    alone = int(np.argmax(retrievals["loose"][1] == DONE))
+    grasps = jax.tree.map(lambda a: a[alone - 1 : alone + 2], retrievals["loose"][0].action)
     actions = stack(stack(over, away, aside), grasps, grasps)
     wanted = np.array([[True, True, True], [True, True, True], [False, False, False]])
     results = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
     assert results[0].tolist() == [HARM, FAILED, DONE]
-    assert results[1].tolist() == became[chosen].tolist()
-    assert results[1][0] == DONE
+    assert int(np.argmax(results[1] == DONE)) == 1
     assert results[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 

@@ -18,14 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.actions import SAMPLED_KINDS, Action, PossibleSpace, all_candidates, kind_of, sample_action
+from mechsearch_jax.actions import SAMPLED_KINDS, Action, all_candidates, kind_of, sample_action
+from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World, from_scenario, true_superquadrics
-from mechsearch_jax.planner import Problem, build_problem
+from mechsearch_jax.planner import Problem, build_problem, initial_belief
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes import by_shape
@@ -152,14 +153,9 @@ def generated_scenes(count: int, seed: int = 0) -> list[Scenario]:
 
 def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
     """A compiled function that draws one valid action for every key, wherever the target may be."""
-    grid = problem.target.grid[:2]
-    nowhere = PossibleSpace(
-        occupied=jnp.zeros(grid, bool),
-        chance=jnp.zeros(grid),
-        origin=problem.poses[0, :2],
-        cell=problem.cell,
-        top=jnp.float32(problem.shelf.board),
-    )
+    belief = initial_belief(problem)
+    everything_seen = belief.replace(unmeasured=jnp.full_like(belief.unmeasured, -jnp.inf))
+    nowhere = possible_space(problem, everything_seen, jnp.zeros_like(belief.exists))
 
     def draw(keys: Array, world: World, problem: Problem) -> Action:
         scene = true_superquadrics(world)

@@ -91,7 +91,7 @@ def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
     if mismatch.resizes:
         sizes = np.asarray(cell.seen_size[:TARGET], np.float32)
     if mismatch.holes != "none":
-        holes = DrawnHoles(np.uint32(cell.holes_seed), HOLES[mismatch.holes])
+        holes = DrawnHoles(np.asarray(cell.holes_seed, np.uint32), HOLES[mismatch.holes])
     parts = place, noise, colour, sizes, holes
     return None if all(part is None for part in parts) else Sensing(*parts)
 

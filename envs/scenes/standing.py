@@ -94,7 +94,7 @@ def _faults(bodies: Sequence[Body | None], world: NativeWorld) -> dict[int, str]
     before = world.positions
     world.drive(np.concatenate([HOME, np.zeros(ROBOT - ARM)])[None])
     shift, turn = _motion(before, world.positions)
-    moves = ~((shift <= SHIFT) & (turn <= TURN))
+    moves = np.asarray(~((shift <= SHIFT) & (turn <= TURN)), bool)
     under, beside = ({t.body for t in contacts if (t.normal[2] > STEEP) == side} for side in (True, False))
     moves[[*(under & beside) - inside.keys()]] = False
     found = {}

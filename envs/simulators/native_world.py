@@ -308,7 +308,8 @@ class NativeWorld:
         for _ in range(self.config.settle_steps // self.config.settle_block):
             states = self._run(hold)
             speed = np.abs(states[:, first : first + 6 * BODIES]).reshape(-1, BODIES, 6)
-            self.restless = ~(speed < limit).all(axis=(0, 2))
+            # Also of what is not a number.
+            self.restless = np.asarray(~(speed < limit).all(axis=(0, 2)), bool)
             if not self.restless.any():
                 break
         self._data.qvel[:] = 0.0

@@ -60,7 +60,8 @@ class Ends(NamedTuple):
 
 def ends_of(depth: Float[np.ndarray, "h w"], axis: int, sign: int) -> Ends:
     """The ends of surfaces in a direction; what is not measured, such as a stereo camera's shadow, is passed over."""
-    ends = Ends(*[np.zeros(0, int)] * 3, axis, sign)
+    none = np.zeros(0, int)
+    ends = Ends(none, none, none, axis, sign)
     turned = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
     turned = np.pad(ends.turned(turned), ((0, 0), (1, 1)), constant_values=np.nan)
     width = turned.shape[1]

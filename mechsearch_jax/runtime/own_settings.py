@@ -41,7 +41,7 @@ def _narrowed(tree: T) -> T:
     """A pytree with its arrays of 64 bits in 32; the same where the program's setting makes none."""
     import jax
 
-    if not jax.config.jax_enable_x64:
+    if not getattr(jax.config, "jax_enable_x64"):  # noqa: B009
         return tree
     wide = {np.dtype(f"{kind}64"): np.dtype(f"{kind}32") for kind in ("float", "int", "uint")}
 

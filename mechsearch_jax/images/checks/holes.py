@@ -6,7 +6,7 @@ Black, shiny and transparent things, and what a stereo camera sees with one eye 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from scipy import ndimage
 
 from mechsearch_jax.images.checks.look import Look, Part
@@ -21,6 +21,11 @@ SMALL = 0.025
 RIM = 0.01
 
 
+def _numbered(pixels: Bool[np.ndarray, "h w"], around: np.ndarray | None = None) -> Int[np.ndarray, "h w"]:
+    """A number for each pixel, the same for connected ones; 0 for the others."""
+    return np.asarray(ndimage.label(pixels, around)[0])  # pyright: ignore[reportIndexIssue]
+
+
 def hole_faults(look: Look) -> tuple[str, ...]:
     """A warning if connected pixels without a measurement could hide a small object in the shelf."""
     part = look.thinned
@@ -28,7 +33,7 @@ def hole_faults(look: Look) -> tuple[str, ...]:
     side = max(3, round(SMALL * density(part.view.camera, look.shelf)))
     # Single pixels in a hole may be measured, by noise.
     holes = ndimage.uniform_filter((np.isnan(part.depth) & into).astype(np.float32), 3) > 0.5
-    labels, _ = ndimage.label(holes)
+    labels = _numbered(holes)
     large = np.unique(labels[ndimage.binary_erosion(holes, np.ones((side, side), bool))])
     if not len(large):
         return ()
@@ -56,8 +61,8 @@ def unmeasured_target_faults(look: Look, observation: Observation) -> tuple[str,
     if bool(observation.target_visible):
         return ()
     part = look.thinned
-    labels, count = ndimage.label(part.detected & np.isnan(part.depth) & _into_shelf(part), np.ones((3, 3)))
-    most = int(np.bincount(labels.ravel())[1:].max(initial=0)) * part.view.stride**2 if count else 0
+    labels = _numbered(part.detected & np.isnan(part.depth) & _into_shelf(part), np.ones((3, 3)))
+    most = int(np.bincount(labels.ravel())[1:].max(initial=0)) * part.view.stride**2
     if most <= found_pixels(look.camera):
         return ()
     return (

@@ -46,7 +46,7 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.n
     """
     import trimesh
 
-    samples, face = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    samples, face = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[:2]
     # Small triangles may have no sample.
     around = np.concatenate([samples, mesh.triangles_center])
     of = np.concatenate([face, np.arange(len(mesh.faces))])

@@ -70,7 +70,7 @@ def whole(parts: Sequence[Trimesh]) -> Trimesh:
     """Several surfaces as one."""
     import trimesh
 
-    return trimesh.util.concatenate(list(parts))
+    return trimesh.util.concatenate(list(parts))  # pyright: ignore[reportReturnType]
 
 
 def open_edges(mesh: Trimesh) -> Int[np.ndarray, "n 2"]:
