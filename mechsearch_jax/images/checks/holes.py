@@ -34,7 +34,8 @@ def hole_faults(look: Look) -> tuple[str, ...]:
     # Single pixels in a hole may be measured, by noise.
     holes = ndimage.uniform_filter((np.isnan(part.depth) & into).astype(np.float32), 3) > 0.5
     labels = _numbered(holes)
-    large = np.unique(labels[ndimage.binary_erosion(holes, np.ones((side, side), bool))])
+    fits = np.asarray(ndimage.binary_erosion(holes, np.ones((side, side), bool)), bool)
+    large = np.unique(labels[fits])
     if not len(large):
         return ()
     sizes = np.bincount(labels.ravel())[large]
