@@ -407,8 +407,9 @@ def test_what_never_comes_to_rest_is_recorded_and_is_no_error(problem):
     episode = run(problem, HIDDEN, Stage(reveal, restless=True))
     assert episode.retrieved
     assert [step.at_rest for step in episode.steps] == [False, False]
-    assert verdict(episode).endswith("retrieved, something never came to rest after action 1, 2")
-    assert events(episode.steps[0]) == ["something never came to rest, and was stopped as it moved"]
+    said = [f"something moved on and never came to rest after action {i}" for i in (1, 2)]
+    assert verdict(episode).endswith(", ".join(["retrieved", *said]))
+    assert events(episode.steps[0]) == ["something moved on, never came to rest, and was stopped"]
     calm = run(problem, HIDDEN, Stage(push_off))
     assert "rest" not in verdict(calm)
     assert events(calm.steps[0]) == ["object 0 fell off the board: nothing can be retrieved any more"]
