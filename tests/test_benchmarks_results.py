@@ -95,7 +95,7 @@ def test_what_happened_on_the_way_is_read_back_and_counted(tmp_path):
     episode = load_episode(tmp_path / "episode.json")
     assert episode.steps == steps
     row = Row.of_episode(episode)
-    assert [getattr(row, name) for name in EVENTS] == [3, 2, 1, 1, 2, 2, 1, 1, 1, 2]
+    assert [getattr(row, name) for name in EVENTS] == [3, 2, 1, 1, 2, 2, 1, 1, 1, 2, 0]
     unknown = Row.of_episode(dataclasses.replace(episode, steps=()))
     assert [getattr(unknown, name) for name in EVENTS] == [None] * len(EVENTS)
 

@@ -36,7 +36,7 @@ EVENTS = (
     *("truth_ruled_out", "truth_ruled_out_step", "blind_actions"),
 )
 # Columns that tables of before do not have; they say nothing of it.
-_LATER = frozenset(("truth_ruled_out", "truth_ruled_out_step", "blind_actions"))
+_LATER = frozenset(("truth_ruled_out", "truth_ruled_out_step", "blind_actions", "decision_version"))
 # How the reason begins where the program failed, not the robot.
 ERROR = "error: "
 # Between kinds of action in their column.
@@ -239,8 +239,6 @@ def _column(kind: Any) -> pyarrow.DataType:
 
 
 _FIELDS = {name: _column(kind) for name, kind in get_type_hints(Row).items()}
-# Columns that earlier versions did not have; null in their rows.
-_LATER = {"decision_version"}
 # The same in rows of the same episode, whichever table they are in.
 EPISODE = "episode"
 # Columns for who reads the table with something else; a row has all of it in its other fields.
