@@ -71,6 +71,7 @@ def test_the_row_of_a_job_is_that_of_its_episode():
     episode = Episode("one", 0, config, {}, (), None, None, False, "error: no", job.scenario.content_hash)
     # What a row does not know of an episode that was not run to its end.
     unknown = {"compile_seconds": None, "device": None, "versions": None}
+    unknown["decision_version"] = DECISION_VERSION
     assert dataclasses.replace(Row.of_episode(episode, present_code()), **unknown) == job.failed("no")
 
 
