@@ -14,6 +14,7 @@ from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.planner import OPTIONS, PRESETS, standard
+from mechsearch_jax.runtime.versions import DECISION_VERSION
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
