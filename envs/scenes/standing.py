@@ -21,7 +21,7 @@ from mechsearch_jax.workspace.scenario import Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Bodies may overlap each other or the shelf by so much [m], and move and turn by so much as they come to rest [m, rad].
-# In shipped, published and generated scenes they overlap by 0.2 mm, move by 0.6 mm and turn by 0.5 degrees at most.
+# In shipped, published and 32 household scenes they overlap by 0.2 mm and move by 0.6 mm at most.
 OVERLAP, SHIFT, TURN = 2e-3, 4e-3, np.radians(4.0)
 # A contact whose normal has a larger z is underneath; others are beside the body.
 STEEP = 0.7
