@@ -1,12 +1,11 @@
 """Holes of a depth camera: connected parts of its image in which nothing is measured.
 
 What has no depth keeps its colour. Lengths in pixels are of an image of 1280 x 720 of the default camera, so that holes
-are as large in a thinned image as in the full one.
+are as large in a thinned image as in the full one. All of it is data, so that a sweep over kinds compiles once.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -20,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Key
 from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, Image
 from mechsearch_jax.envs.world.mismatch import HolesName
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
-from mechsearch_jax.runtime.errors import check_range
 from mechsearch_jax.workspace.camera import Camera
 
 USUAL_FX = Camera().fx
@@ -34,9 +32,8 @@ WAVES, PATCH, CLUMP = 32, 160.0, 12.0
 CLUMPED = 2 / 3
 
 
-@dataclasses.dataclass(frozen=True)
-class Holes:
-    """What of a depth image is not measured. Hashable.
+class Holes(flax.struct.PyTreeNode):
+    """What of a depth image is not measured; each may be traced.
 
     Attributes:
       objects: probability of each object that it has no depth, as black, shiny and transparent things.
@@ -48,16 +45,12 @@ class Holes:
       patches: share of the pixels that show shelf or bodies which lie in connected patches without depth.
     """
 
-    objects: float = 0.0
-    at_least_one: bool = False
-    target: bool = False
-    shadows: bool = False
-    scattered: float = 0.0
-    patches: float = 0.0
-
-    def __post_init__(self):
-        for name in ("objects", "scattered", "patches"):
-            check_range(f"Holes: {name}", getattr(self, name), 0.0, 1.0, "")
+    objects: jax.Array | float = 0.0
+    at_least_one: jax.Array | bool = False
+    target: jax.Array | bool = False
+    shadows: jax.Array | bool = False
+    scattered: jax.Array | float = 0.0
+    patches: jax.Array | float = 0.0
 
 
 HOLES: Mapping[HolesName, Holes] = MappingProxyType(
@@ -77,20 +70,18 @@ class DrawnHoles(flax.struct.PyTreeNode):
 
     Attributes:
       seed: of what is drawn, uint32, shape (...).
-      holes: of which kinds; static.
+      holes: of which kinds.
     """
 
     seed: jax.Array | np.ndarray
-    holes: Holes = flax.struct.field(pytree_node=False)
+    holes: Holes
 
     def without_depth(self, world: World) -> Bool[Array, " 9"]:
         """Which bodies have no depth; none of those that are not there."""
         chance = jax.random.uniform(self._key(0), (TARGET,))
         chance = jnp.where(world.valid[:TARGET], chance, jnp.inf)
-        blank = chance < self.holes.objects
-        if self.holes.at_least_one:
-            blank |= jnp.isfinite(chance) & (chance == jnp.min(chance))
-        return jnp.append(blank, self.holes.target & world.valid[TARGET])
+        one = jnp.isfinite(chance) & (chance == jnp.min(chance)) & self.holes.at_least_one
+        return jnp.append(one | (chance < self.holes.objects), self.holes.target & world.valid[TARGET])
 
     def of(self, camera: Camera, world: World, image: Image) -> Bool[Array, "h w"]:
         """Which pixels of an image have no depth.
@@ -100,19 +91,14 @@ class DrawnHoles(flax.struct.PyTreeNode):
           world: the bodies in it.
           image: as `observe` returns it.
         """
-        owner, holes = image.segmentation, self.holes
+        owner, holes = image.segmentation, jax.tree.map(jnp.asarray, self.holes)
         is_body = (owner >= 0) & (owner < BODIES)
         lost = is_body & self.without_depth(world)[jnp.clip(owner, 0, TARGET)]
-        if holes.shadows:
-            lost |= shadows(camera, image.depth)
-        if holes.scattered:
-            clumped = CLUMPED * holes.scattered
-            single = (holes.scattered - clumped) / (1.0 - clumped)
-            lost |= blobs(self._key(1), camera, jnp.ones(owner.shape, bool), clumped, CLUMP)
-            lost |= jax.random.uniform(self._key(2), owner.shape) < single
-        if holes.patches:
-            lost |= blobs(self._key(3), camera, owner != BACKGROUND, holes.patches, PATCH)
-        return lost
+        lost |= shadows(camera, image.depth) & holes.shadows
+        clumped = CLUMPED * holes.scattered
+        lost |= blobs(self._key(1), camera, jnp.ones(owner.shape, bool), clumped, CLUMP)
+        lost |= jax.random.uniform(self._key(2), owner.shape) < (holes.scattered - clumped) / (1.0 - clumped)
+        return lost | blobs(self._key(3), camera, owner != BACKGROUND, holes.patches, PATCH)
 
     def _key(self, number: int) -> Key[Array, ""]:
         return jax.random.fold_in(jax.random.key(self.seed), number)
@@ -138,7 +124,7 @@ def shadows(camera: Camera, depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
 
 
 def blobs(
-    key: Key[Array, ""], camera: Camera, inside: Bool[Array, "h w"], share: float, length: float
+    key: Key[Array, ""], camera: Camera, inside: Bool[Array, "h w"], share: jax.Array | float, length: float
 ) -> Bool[Array, "h w"]:
     """Connected blobs that take a share of the pixels `inside`.
 

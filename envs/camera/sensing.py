@@ -91,7 +91,10 @@ def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
     if mismatch.resizes:
         sizes = np.asarray(cell.seen_size[:TARGET], np.float32)
     if mismatch.holes != "none":
-        holes = DrawnHoles(np.asarray(cell.holes_seed, np.uint32), HOLES[mismatch.holes])
+        kinds = jax.tree.map(
+            lambda n: np.asarray(n, bool if isinstance(n, bool) else np.float32), HOLES[mismatch.holes]
+        )
+        holes = DrawnHoles(np.asarray(cell.holes_seed, np.uint32), kinds)
     parts = place, noise, colour, sizes, holes
     return None if all(part is None for part in parts) else Sensing(*parts)
 

@@ -156,7 +156,8 @@ class Mismatch:
 
     def mould(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
-        return self.moves_camera, self.resizes, self.measures_otherwise, self.colours_otherwise, self.holes
+        has_holes = self.holes != "none"
+        return self.moves_camera, self.resizes, self.measures_otherwise, self.colours_otherwise, has_holes
 
     def check(self, recognition: str, engine: str) -> None:
         """Check that episodes with a recogniser and a simulator, by their names, can have this mismatch.
