@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import math
@@ -10,13 +11,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
-from mechsearch_jax.envs.world.model import compile_model
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasp_config import GraspConfig
@@ -36,8 +37,6 @@ from mechsearch_jax.workspace.target import Target
 CATALOGUE = ObjectSizes().catalogue
 # By so much the image is reduced in which a compound must not show at all.
 COARSE = 8
-# `impratio` while bodies are dropped: poses to the micrometre, and with them all recorded scenes, depend on it.
-DROPPED_RATIO = 10.0
 # Draws an object, as it stands with its centre above the origin of a board at z 0.
 DrawBody = Callable[[np.random.Generator], Body]
 
@@ -140,6 +139,16 @@ def _any_grasp(
     return jnp.any(feasible_grasps(tables, shelf, gripper, GraspConfig(), T_world_target[None]))
 
 
+class _DroppingWorld(NativeWorld):
+    """A world in which friction gives way a little and does not act against rolling, as when the scene sets were
+    recorded: poses to the micrometre, and with them all recorded scenes, depend on it."""
+
+    def _model_for(self, bodies: list[Body | None]) -> mujoco.MjModel:
+        model = copy.copy(super()._model_for(bodies))
+        model.opt.impratio, model.geom_condim[:] = 10.0, 4
+        return model
+
+
 class ScenarioGenerator:
     """Makes scenarios; the same seed gives the same scenario on the same machine.
 
@@ -179,9 +188,7 @@ class ScenarioGenerator:
             spawn = getattr(self._shelf, f"spawn_{name}")
             if not (spawn[0] < high and spawn[1] > low):
                 raise InputError(f"Shelf: spawn_{name} {spawn} is beside the board, which reaches from {low} to {high}")
-        blank = compile_model(self._shelf, self._camera)
-        blank.opt.impratio = DROPPED_RATIO
-        self._simulator = NativeWorld(self._shelf, self._camera, blank=blank)
+        self._simulator = _DroppingWorld(self._shelf, self._camera)
         self._poses = self.target.candidate_poses(self._shelf).astype(float)
         if self.config.anywhere:
             self._graspable = graspable or graspable_at(self._shelf, self.target, gripper)

@@ -165,9 +165,7 @@ class NativeWorld:
         compounds = models.compounds_in(bodies)
         if not compounds:
             return self._blank
-        model = models.compile_model(self.shelf, self.camera, self._blank.opt.timestep, compounds)
-        model.opt.impratio = self._blank.opt.impratio
-        return model
+        return models.compile_model(self.shelf, self.camera, self._blank.opt.timestep, compounds)
 
     def drive(self, controls: Float[np.ndarray, "steps 9"], at_once: bool = False) -> Float[np.ndarray, "steps 9"]:
         """Step with one row of controls per step from where everything is, and let the bodies come to rest.

@@ -15,6 +15,9 @@ from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, inertial, so
 
 # Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; otherwise negligible.
 BODY_DAMPING = 2e-3
+# Friction of bodies against turning on the spot and against rolling [m], the larger of two bodies' in a contact. Without
+# the latter bottles that were pushed roll on, on their sides and on their rims, for many seconds.
+BODY_TORSION, BODY_ROLLING = 5e-3, 3e-4
 TINY = 1e-3
 # Mass of an empty slot [kg], and its moments of inertia [kg m2].
 EMPTY_MASS, EMPTY_INERTIA = 1e-3, 1e-6
@@ -50,7 +53,8 @@ def add_bodies(
             continue
         for shape in in_order():
             name = geometry_name(shape, i)
-            element(body, "geom", class_="object", name=name, type=shape.geometry, friction=text(shape.friction))
+            friction = text(shape.friction, BODY_TORSION, BODY_ROLLING)
+            element(body, "geom", class_="object", name=name, type=shape.geometry, friction=friction)
 
 
 def geometry_name(shape: Shape, slot: int) -> str:
@@ -85,7 +89,7 @@ def add_compound(
             "name": f"solid{slot}_{i}",
             "pos": text(*solid.position),
             "quat": text(*solid.quaternion),
-            "friction": text(compound.friction),
+            "friction": text(compound.friction, BODY_TORSION, BODY_ROLLING),
         }
         attributes |= _mesh(root, attributes["name"], solid, skin) if solid.shape == CONVEX else _size(solid, skin)
         ElementTree.SubElement(body, "geom", attributes)

@@ -60,8 +60,7 @@ FINGER_TRAVEL = 0.04
 MARGIN = 5e-4
 OBJECT_BIT, ROBOT_BIT = 1, 2
 
-# How much stiffer friction is than contact (`impratio`). Friction gives way a little as long as it holds: at 10, what
-# leans creeps by up to 5 mm/s for as long as one looks, at 100 by less than 1 mm/s, with as many steps a second.
+# How much stiffer friction is than contact (`impratio`): at 10 what leans creeps at up to 5 mm/s, at 100 below 1 mm/s.
 IMPEDANCE_RATIO = 100.0
 
 # Mass [kg], centre of mass [m], and inertia about it (xx, yy, zz, xy, xz, yz) [kg m2] of links 1 to 7: C. Gaz et al.,
@@ -117,7 +116,8 @@ def _add_defaults(root: ElementTree.Element) -> None:
         group="3",
     )
     objects = element(default, "default", class_="object")
-    element(objects, "geom", contype=str(OBJECT_BIT), conaffinity=str(OBJECT_BIT), size=text(*[TINY] * 3), group="0")
+    size, bit = text(*[TINY] * 3), str(OBJECT_BIT)
+    element(objects, "geom", condim="6", contype=bit, conaffinity=bit, size=size, group="0")
     # The friction of a contact is the larger of the two, here that of the body on the plane.
     planes = element(default, "default", class_="plane")
     element(planes, "geom", type="plane", contype="0", conaffinity=str(OBJECT_BIT), friction="0 0 0", group="4")
