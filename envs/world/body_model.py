@@ -15,8 +15,8 @@ from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, inertial, so
 
 # Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; otherwise negligible.
 BODY_DAMPING = 2e-3
-# Friction of bodies against turning on the spot and against rolling [m], the larger of two bodies' in a contact. Without
-# the latter bottles that were pushed roll on, on their sides and on their rims, for many seconds.
+# Friction of bodies against turning on the spot and against rolling [m]. Without the latter bottles that were pushed
+# roll on, on their sides and on their rims, for many seconds.
 BODY_TORSION, BODY_ROLLING = 5e-3, 3e-4
 TINY = 1e-3
 # Mass of an empty slot [kg], and its moments of inertia [kg m2].
