@@ -47,15 +47,15 @@ class MjxConfig:
       contacts: capacity for contacts, per world on average; the buffer is shared.
       rows: capacity for constraint rows in every world.
       compound_contacts, compound_rows: the same of worlds of compounds, whose many solids touch more at once. C MuJoCo
-        needs 55 contacts and 221 rows at most in household scenes with eight objects; Warp may find more.
+        needs 55 contacts at most in household scenes with eight objects, 6 rows each; Warp may find more.
       chunk: time steps between checks whether all worlds are done.
     """
 
     simulator: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
     contacts: int = 64
-    rows: int = 320
+    rows: int = 480
     compound_contacts: int = 96
-    compound_rows: int = 480
+    compound_rows: int = 720
     chunk: int = 25
 
     def __post_init__(self):

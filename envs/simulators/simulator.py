@@ -48,7 +48,7 @@ class SimulatorConfig:
     motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
     rest_speed: float = 2e-3
     settle_steps: int = 1500
-    settle_block: int = 50
+    settle_block: int = 25
     slip: float = 0.03
     tracking_bound: float = 0.05
     trace_every: int = 25
