@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasp_config import GraspConfig
@@ -188,7 +189,7 @@ class ScenarioGenerator:
             spawn = getattr(self._shelf, f"spawn_{name}")
             if not (spawn[0] < high and spawn[1] > low):
                 raise InputError(f"Shelf: spawn_{name} {spawn} is beside the board, which reaches from {low} to {high}")
-        self._simulator = _DroppingWorld(self._shelf, self._camera)
+        self._simulator = _DroppingWorld(self._shelf, self._camera, SimulatorConfig(settle_block=50))
         self._poses = self.target.candidate_poses(self._shelf).astype(float)
         if self.config.anywhere:
             self._graspable = graspable or graspable_at(self._shelf, self.target, gripper)
