@@ -21,6 +21,8 @@ from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.cell.loading import load_searcher
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.pushing.physics_push import NativePhysics
 from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
@@ -267,18 +269,26 @@ def test_what_a_policy_does_not_propose_cannot_be_tried(problem):
 
 
 def test_an_option_that_would_have_no_effect_is_refused():
-    with pytest.raises(InputError, match=r'config names the rehearsal "physics", and none is given.*load_searcher'):
-        Searcher(config=standard())
-    with pytest.raises(InputError, match=r'rehearsal "learning", and none is given.*rehearsal=LearningTrials\(\)'):
-        Searcher(config=standard(rehearsal="learning"))
     for policy in (None, search_for_grasp(tries=True)):
         with pytest.raises(InputError, match=r"one that learns nothing is given; give rehearsal=LearningTrials\(\)"):
             Searcher(config=standard(rehearsal="learning"), rehearsal=NativeTrials(), policy=policy)
     Searcher(config=standard(rehearsal="learning"), rehearsal=LearningTrials())
-    with pytest.raises(InputError, match='config names the push model "physics"'):
-        Searcher(config=standard(rehearsal="none", push_model="physics"))
     with pytest.raises(InputError, match='config names the push model "quasi-static", and another is given'):
         Searcher(config=standard(rehearsal="none", push_model="quasi-static"), push_model=own_push_model("learned"))
+
+
+def test_what_a_configuration_names_is_what_decides_by_default():
+    method = Method()
+    searcher = Searcher()
+    assert searcher.config == method.config
+    assert (searcher._policy, searcher._trials) == (method.policy(), method.trials())
+    assert isinstance(Searcher(config=standard(rehearsal="learning"))._trials, LearningTrials)
+    physics = Searcher(config=standard(rehearsal="none", push_model="physics"))
+    assert physics._trials is None
+    assert isinstance(physics._policy.predict.push_model, NativePhysics)
+    # A policy tries what it proposes; a user's may do without.
+    assert Searcher(policy=search_for_grasp(tries=True))._trials == method.trials()
+    assert Searcher(policy=search_for_grasp())._trials is Searcher(policy=idle)._trials is None
 
 
 def test_what_a_configuration_names_and_a_slot_holds_decides():
@@ -291,7 +301,7 @@ def test_what_a_configuration_names_and_a_slot_holds_decides():
 
 
 def test_where_nothing_is_tried_out_it_says_so(problem):
-    plain, bold = Searcher(), Searcher(rehearsal=NativeTrials())
+    plain, bold = Searcher(config=standard(rehearsal="none")), Searcher()
     for searcher in (plain, bold):
         searcher.problem, searcher.recogniser = problem, lambda *images: seen(OPEN)
     assert "no action is tried out before it is made" in plain.check().notices[0]

@@ -48,8 +48,8 @@ from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session import faults, warming
 from mechsearch_jax.session.images import Images, converted
+from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
 from mechsearch_jax.session.preparing import first_decision, prepared
-from mechsearch_jax.session.slots import UNTRIED, filled, tries_nothing
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import Motion, Present, SearchStep, display_image, motion_of
 from mechsearch_jax.session.view import View
@@ -102,16 +102,16 @@ class Searcher:
 
         Args:
           workcell: camera, shelf, gripper and target; the defaults if left out.
-          config: of the problem and the planner, and the largest number of actions; preset `standard` without a
-            rehearsal if left out. A push model or rehearsal that needs a simulator must be given as an argument, too;
-            `envs.cell.loading.load_searcher` makes them from a file.
+          config: of the problem and the planner, and the largest number of actions; preset `standard` if left out.
+            `envs.cell.loading.load_searcher` reads it from a file.
           seed: of all random numbers.
           policy: decides; by default search-for-grasp with `config.planner`. A policy brings its own planner
             configuration and push models.
           push_model, later_push_model: predict pushes, the latter those after the first action of a sequence; by
             default the one that `config` names.
-          rehearsal: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`.
-            Without it, the target is only taken out where nothing is touched; `check` and each step's reason say so.
+          rehearsal: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`; by
+            default what `config` names. With "none", the target is only taken out where nothing is touched; `check`
+            and each step's reason say so.
           recogniser: makes a recogniser of a problem; it is called like `Recogniser`.
           trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
             move; the default if left out.
@@ -120,17 +120,15 @@ class Searcher:
 
         Raises:
           InputError: the target cannot be grasped by the gripper, the camera does not see the shelf, a policy is given
-            together with push models, or `config` names a push model or rehearsal that is not given.
+            together with push models, or `config` names others than are given.
         """
-        slots: dict[str, Any] = {
-            "push_model": push_model,
-            "later_push_model": later_push_model,
-        }
         self.workcell = workcell or Workcell()
         check_camera(self.workcell.camera, self.workcell.shelf)
-        self.config = config or standard(rehearsal="none")
+        self.config = config or standard()
         self._seed = seed
-        self._policy, self._trials = filled(policy, self.config, rehearsal, slots), rehearsal
+        self._policy, self._trials = policy_and_trials(
+            self.config, self.workcell.shelf, policy, rehearsal, push_model, later_push_model
+        )
         self._make_recogniser = recogniser
         self._trajectories = trajectories
         self._view, self._shown = view, None

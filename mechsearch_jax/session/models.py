@@ -1,20 +1,20 @@
-"""The policy of a searcher: a given one, or search-for-grasp with given models."""
+"""The policy and the trials of a searcher: given ones, or those that its configuration names."""
 
 from __future__ import annotations
 
-from typing import Any
-
 from mechsearch_jax.config.config import Config
-from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.planner.learning import LearnsFriction
 from mechsearch_jax.planner.policies import PlanningPolicy, Policy, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session import simulated
+from mechsearch_jax.workspace.shelf import Shelf
 
 # The notice where no action is tried in physics.
 UNTRIED = (
     "rehearsal: no action is tried out before it is made, so that less is found and retrieved than the results say; "
-    "envs.cell.loading.load_searcher, or rehearsal=NativeTrials(), tries them in simulation"
+    'leave out rehearsal="none", or make the policy with tries=True'
 )
 
 
@@ -23,15 +23,24 @@ def tries_nothing(policy: Policy, trials: Trials | None) -> bool:
     return isinstance(policy, PlanningPolicy) and (trials is None or not policy.tries)
 
 
-def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: dict[str, Any]) -> Policy:
-    """The given policy, or search-for-grasp with the given models.
+def policy_and_trials(
+    config: Config,
+    shelf: Shelf,
+    policy: Policy | None,
+    trials: Trials | None,
+    push_model: PushModel | None,
+    later_push_model: PushModel | None,
+) -> tuple[Policy, Trials | None]:
+    """The given policy, or search-for-grasp, with the given models and trials, or those that the configuration names.
+
+    A policy that proposes nothing to be tried has no trials, nor has a user's, unless they are given.
 
     Raises:
-      InputError: a push model is given together with a policy, a rehearsal is given with a policy that proposes no
-        trials, the configuration names a model or rehearsal that is not given, or one that learns is named and another
-        given.
+      InputError: a push model is given together with a policy, or beside another that the configuration names; trials
+        are given with a policy that proposes none; or the configuration names trials that learn, and others are given.
     """
-    given = [name for name, value in slots.items() if value is not None]
+    models = {"push_model": push_model, "later_push_model": later_push_model}
+    given = [name for name, model in models.items() if model is not None]
     if config.rehearsal == "learning" and trials is not None and not isinstance(trials, LearnsFriction):
         raise InputError(
             'Searcher: config names the rehearsal "learning", and one that learns nothing is given; give '
@@ -48,23 +57,17 @@ def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: 
                 "Searcher: rehearsal would have no effect, for the policy proposes nothing to be tried; make it with "
                 "tries=True"
             )
-        return policy
-    if config.rehearsal != "none" and trials is None:
-        kind, module = ("LearningTrials", "learning") if config.rehearsal == "learning" else ("NativeTrials", "native")
-        raise InputError(
-            f'Searcher: config names the rehearsal "{config.rehearsal}", and none is given; use '
-            f"mechsearch_jax.envs.cell.loading.load_searcher, give rehearsal={kind}() (envs.trials.{module}), or a "
-            'config with rehearsal="none"'
-        )
-    if slots["push_model"] is None:
-        if config.push_model == "physics":
-            raise InputError(
-                'Searcher: config names the push model "physics", and none is given; use '
-                'mechsearch_jax.envs.cell.loading.load_searcher, give push_model, or a config with push_model="learned"'
-            )
-        slots = {**slots, "push_model": own_push_model(config.push_model)}
+        proposes = isinstance(policy, PlanningPolicy) and policy.tries
+        return policy, simulated.trials(config.rehearsal) if trials is None and proposes else trials
+    if trials is None:
+        trials = simulated.trials(config.rehearsal)
+    if push_model is None:
+        push_model, later = simulated.push_models(config.push_model, shelf)
+        later_push_model = later if later_push_model is None else later_push_model
     elif config.push_model == "quasi-static":
         raise InputError(
             'Searcher: config names the push model "quasi-static", and another is given; leave out one of them'
         )
-    return search_for_grasp(config.planner, tries=trials is not None, **slots)
+    return search_for_grasp(
+        config.planner, tries=trials is not None, push_model=push_model, later_push_model=later_push_model
+    ), trials
