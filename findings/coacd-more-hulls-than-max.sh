@@ -2,7 +2,7 @@
 # CoACD returns more convex hulls than max_convex_hull allows, without a word, where a mesh has parts that do not touch.
 #
 # coacd 1.0.14 (pip, Linux, Python 3.11). The mesh is closed and manifold: four boxes, 40 mm apart. `max_convex_hull` is
-# "the maximum number of convex hulls in the result" (README of CoACD; merging, which it needs, is on by default).
+# "max # convex hulls in the result" (README of CoACD; merging, which it needs, is on by default).
 # Expected: at most 2 hulls, or an error. Output of this script:
 #   max_convex_hull=2: 4 hulls
 # Whoever has room for so many hulls has to count them, and to join them himself.
