@@ -25,7 +25,6 @@ from mechsearch_jax.benchmarks.statistics.actions_until import (
     restricted_means,
     restricted_steps,
 )
-from mechsearch_jax.benchmarks.statistics.closed_gap import closed_gap
 from mechsearch_jax.benchmarks.statistics.intervals import ratio_interval
 from mechsearch_jax.benchmarks.statistics.paired import paired
 from mechsearch_jax.benchmarks.statistics.rates import GOALS
@@ -131,31 +130,6 @@ def times(name, steps, policy="greedy"):
         row_of(f"c2-2-{i:03d}", method, found_step=step, **(LOST if step is None else {}))
         for i, step in enumerate(steps)
     ]
-
-
-def test_a_gap_is_closed_by_a_share():
-    worse, ours, better = times("r", [8, None, 6]), times("p", [4, 7, 6, 1]), times("b", [0, 0, 2])
-    gap = closed_gap(ours, worse, better, FOUND)
-    # 24, 17 and 2 actions on the three scenes that all have.
-    assert (gap.share, gap.pairs) == (7 / 22, 3)
-    assert closed_gap(worse, worse, better, FOUND).share == 0.0
-    assert closed_gap(better, worse, better, FOUND).share == 1.0
-    # Worse than the worse one: below 0.
-    assert closed_gap(times("p", [9, 10, 9]), worse, better, FOUND).share == -4 / 22
-    assert closed_gap(ours[3:], worse, better, FOUND) == dataclasses.replace(gap, share=None, interval=None, pairs=0)
-    assert closed_gap(ours, worse, worse, FOUND).share is None
-
-
-def test_the_share_of_a_gap_has_the_interval_of_drawn_scenes():
-    rng = np.random.default_rng(3)
-    steps = [rng.integers(low, high, 60) for low, high in ((0, 6), (3, 11), (0, 3))]
-    ours, worse, better = (times("x", each.tolist()) for each in steps)
-    gap = closed_gap(ours, worse, better, FOUND)
-    p, r, b = (np.array(each, float) for each in steps)
-    drawn = rng.integers(0, 60, (20_000, 60))
-    ratios = (r - p)[drawn].sum(axis=1) / (r - b)[drawn].sum(axis=1)
-    assert gap.share == pytest.approx((r - p).sum() / (r - b).sum(), abs=1e-12)
-    assert gap.interval == pytest.approx(np.quantile(ratios, [0.025, 0.975]), abs=0.02)
 
 
 def test_a_ratio_to_what_may_be_nothing_has_no_interval():

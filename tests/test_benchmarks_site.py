@@ -215,7 +215,7 @@ def test_steps_that_are_left_out_are_counted():
 
 
 def test_one_command_writes_every_page_that_the_docs_name():
-    text = (ROOT / "docs/commands.md").read_text() + (ROOT / "docs/studies.md").read_text()
+    text = (ROOT / "docs/commands.md").read_text()
     named = set(re.findall(r"`python -m (mechsearch_jax\.benchmarks\.[a-z_.]+(?:page|pages|seconds))\b", text))
     assert named - {all_pages.__name__} == {write.__module__ for write in all_pages.PAGES.values()}
 

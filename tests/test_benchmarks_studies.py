@@ -2,17 +2,12 @@
 
 import dataclasses
 import random
-import sys
 
 import pytest
 from stored_rows import row_of
 
-from mechsearch_jax.benchmarks.report.store_run import run_of
-from mechsearch_jax.benchmarks.studies import page
 from mechsearch_jax.benchmarks.studies.comparison import compare, screen, sentence
 from mechsearch_jax.benchmarks.studies.declared import GROUPS, STUDIES
-from mechsearch_jax.benchmarks.studies.pictures import picture
-from mechsearch_jax.benchmarks.studies.shown import shown, shown_study, source
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant, find_studies
 from mechsearch_jax.commands import study as command
 from mechsearch_jax.commands.main import parse
@@ -137,75 +132,16 @@ def test_the_actions_of_errors_do_not_count():
     assert (second.changes["retrieved"].pairs, second.changes["retrieved"].losses) == (50, 10)
 
 
-def test_of_runs_with_as_many_variants_the_newest_is_shown():
-    rows = rows_of(STUDY.baseline, 1.0)
-    days = {"a": "2026-11-24", "b": "2026-11-26", "c": "2026-11-25"}
-    runs = [run_of(name, rows, command="x", started=day) for name, day in days.items()]
-    assert list(shown_study(STUDY, runs).labels) == ["b"]
-    assert shown_study(STUDY, []) is None
-    other = run_of("d", rows_of(STUDY.variants[1], 1.0), command="x", started="2026-11-27")
-    assert shown_study(STUDY, [other]) is None
-
-
-def test_a_variant_that_a_run_lacks_comes_from_another_one_of_the_same_simulator():
-    base, other = STUDY.variants
-    first = run_of("a", rows_of(base, 1.0), command="x", started="2026-11-25")
-    later = run_of("b", [*rows_of(base, 0.0), *rows_of(other, 0.5)][:60], command="x", started="2026-11-26")
-    alone = run_of("c", rows_of(other, 0.0), command="x", started="2026-11-27")
-    native = run_of("d", rows_of(other, 0.0, engine="NativeSimulator"), command="x", started="2026-11-28")
-    both = shown_study(STUDY, [alone, first, native])
-    assert both.labels == {"a": ["0.9"], "c": ["0.5"]}
-    assert [each.means["retrieved"] for each in both.comparisons] == [1.0, 0.0]
-    assert both.comparisons[1].changes["retrieved"].mean == -1.0
-    assert "runs/a.jsonl); from [c](../benchmarks/results/runs/c.jsonl): 0.5." in source(both)
-    # The run that has both goes first, and nothing is taken from the others.
-    assert shown_study(STUDY, [alone, first, later]).labels == {"b": ["0.9", "0.5"]}
-    assert shown_study(STUDY, [first, native]).labels == {"a": ["0.9"]}
-
-
 def test_without_partners_the_sentence_says_whose_rows_lack():
     base, other = STUDY.variants
     assert sentence(STUDY, compare(STUDY, rows_of(base, 1.0))) == "There are no rows of another variant yet."
     assert sentence(STUDY, compare(STUDY, rows_of(other, 1.0))) == "There are no rows of 0.9 yet."
 
 
-def test_another_folder_is_no_page_without_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["page", "--runs", str(tmp_path / "none"), "--out", str(tmp_path / "studies.md")])
-    with pytest.raises(SystemExit):
-        page.main()
-    assert "none: is no folder; start it at the root of a checkout" in capsys.readouterr().err
-    assert not (tmp_path / "studies.md").exists()
-
-
 def test_what_is_the_same_within_chance_is_called_so():
     base, other = STUDY.variants
     text = sentence(STUDY, compare(STUDY, [*rows_of(base, 0.5, first=1), *rows_of(other, 0.5, first=2)]))
     assert text.endswith("no difference is certain with 0.5.")
-
-
-def test_the_page_shows_the_run_that_has_most_of_a_study_and_says_what_is_not_there():
-    gamma = STUDIES["gamma"]
-    old = run_of("old", rows_of(gamma.variants[0], 1.0), command="x")
-    new = run_of("new", [row for variant in gamma.variants[:3] for row in rows_of(variant, 0.8)], command="x")
-    text = page.page(shown([old, new]))
-    assert "[new](../benchmarks/results/runs/new.jsonl)" in text
-    assert "runs/old.jsonl" not in text
-    assert "Not run: gamma 0.7, gamma 0.8, gamma 1." in text
-    assert text.count("| `mechsearch study ") == len(STUDIES) - 1
-    assert "scenes that settings were chosen on" in text
-    assert set(shown([old, new])) == {"gamma"}
-
-
-@pytest.mark.parametrize("name", ["gamma", "actions", "baselines"])
-def test_pictures_are_drawn(name, tmp_path):
-    study = STUDIES[name]
-    scenes = dataclasses.replace(study, scenes="development")
-    rows = [row for variant in study.variants[:4] for row in rows_of(variant, 0.7)]
-    figure = picture(scenes, compare(scenes, rows))
-    figure.savefig(tmp_path / "x.png")
-    (axes,) = figure.axes
-    assert axes.get_xlabel()
-    assert (tmp_path / "x.png").stat().st_size > 5000
 
 
 def test_the_command_says_what_it_would_do(capsys, tmp_path):

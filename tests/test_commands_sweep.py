@@ -276,7 +276,7 @@ def test_the_seconds_of_the_package_are_those_of_the_stored_runs():
     assert written == entries(results, stored_runs(results / "runs")), f"run `python -m {entries.__module__}`"
     assert {H100} <= {entry["device"] for entry in written}
     on_gpu = {entry["simulator"] for entry in written if entry["device"] == H100}
-    assert on_gpu == {"MjxSimulator", "NativeSimulator"}
+    assert "MjxSimulator" in on_gpu
 
 
 def test_of_several_runs_the_fastest_counts():

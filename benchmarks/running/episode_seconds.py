@@ -133,7 +133,7 @@ def stored_seconds() -> Sequence[StoredSeconds]:
 
 
 def nearest(device: str, kind: Kind, stored: Sequence[StoredSeconds]) -> StoredSeconds | None:
-    """What tells most of how long episodes take: what both dry runs and docs/costs.md count with.
+    """What tells most of how long episodes take: what dry runs count with.
 
     Args:
       device: as `runtime.versions.versions` says it.

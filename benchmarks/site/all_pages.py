@@ -8,16 +8,11 @@ from collections.abc import Callable, Sequence
 from mechsearch_jax.benchmarks.report import reproduction_page, results_page
 from mechsearch_jax.benchmarks.running import episode_seconds
 from mechsearch_jax.benchmarks.site import network_pages, set_pages
-from mechsearch_jax.benchmarks.studies import costs_page
-from mechsearch_jax.benchmarks.studies import page as studies_page
 
-# In this order: costs are estimated from how long episodes took.
 PAGES: dict[str, Callable[[Sequence[str]], None]] = {
     "benchmarks/running/episode_seconds.json": episode_seconds.main,
     "docs/reproduction.md": reproduction_page.main,
-    "docs/studies.md and docs/yardstick.md": studies_page.main,
     "docs/results.md": results_page.main,
-    "docs/costs.md": costs_page.main,
     "docs/scene-sets": set_pages.main,
     "docs/networks": network_pages.main,
 }

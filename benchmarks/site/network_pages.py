@@ -213,14 +213,10 @@ CARD_OF: dict[str, Card] = {
             "`mechsearch bench push`, simulated pushes in scenes that no training has seen: mean errors of the pushed "
             "object and of others that were moved, and how well it knows what stays and what falls over."
         ),
-        also=(
-            "Beside other push models, and what it means for episodes: [results](../results.md#predicting-pushes), "
-            "[studies](../studies.md#push-model)."
-        ),
+        also=("Beside other push models, and what it means for episodes: [results](../results.md#predicting-pushes)."),
         limits=(
             "It knows the frictions and the masses of the simulated world, and takes neither as an input: on another "
-            "board, or with other objects, it is wrong without saying so. [What friction does to "
-            "episodes](../studies.md#friction).",
+            "board, or with other objects, it is wrong without saying so.",
             "Pushes of 2 to 20 cm by the robot's closed hand, among 8 objects at most.",
             "The longer a push, the worse it is predicted, as the table says.",
             _SHAPES,

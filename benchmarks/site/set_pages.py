@@ -208,7 +208,7 @@ def _rates(name: str, lines: Iterable[Line], about: About) -> dict[str, Any]:
     partly = any(0 < line["scenes_chosen_on"] < line["scenes"] for line in shown)
     others = sorted({line["run"] for line in of_set if not is_shown(line, about)})
     links = ", ".join(f"[{run}](../../{RESULTS}/runs/{run}.jsonl)" for run in others)
-    where = "[studies](../studies.md), [log](../experiments.md)"
+    where = "[log](../experiments.md)"
     return {
         "tables": rate_tables(shown),
         "scope": "Shares are of episodes on scenes that nothing was chosen on." if partly else "",

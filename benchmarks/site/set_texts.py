@@ -78,8 +78,8 @@ ABOUT: dict[str, About] = {
     "development": About(
         "for trying things",
         "Made as [`c2`](c2.md) is, for trying things and choosing settings: look at these scenes as often as you like. "
-        "The ablation [studies](../studies.md#ablations) run on them, and so does [the "
-        "guard](../commands.md#the-guard). Rates here are biased towards what was chosen.",
+        "[The guard](../commands.md#the-guard) "
+        "and ablations run on them. Rates here are biased towards what was chosen.",
         shown=_EACH,
     ),
     "development-box": About(
@@ -91,15 +91,8 @@ ABOUT: dict[str, About] = {
         "to report with",
         "Nine sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
         "Each is used once, because scenes that were looked at are no longer unseen; so no picture of them is shown. "
-        "Those with rates below are used: `report-a` by the baselines and the robustness [studies](../studies.md), "
-        "`report-e` by what the default of 2026-11-26 [comes to](../results.md), then to choose that grasps have to "
-        "succeed nearby; `report-f` by what that comes to, and then by grasps that have to succeed with another "
-        "friction; `report-g` by what the default until 2026-11-28 comes to, also where friction, masses and shapes "
-        "are not known; "
-        "`report-h` by what grasps of the narrow sides of boxes gain (000 to 059), and then by what the default with "
-        "them comes to; `report-i` by what the default comes to whose retrievals are within 75 instead of 45 degrees, "
-        "and then by it where friction and shapes are not known. "
-        "Runs up to `trials-before-h200` are of before both.",
+        "All nine are used; what each was used for is in the [log](../experiments.md). `report-i` reports what the "
+        "default comes to, and what it comes to where friction and shapes are not known.",
         sets=tuple(f"report-{letter}" for letter in "abcdefghi"),
     ),
     **{
@@ -134,9 +127,7 @@ ABOUT: dict[str, About] = {
     "report-household": About(
         "household things, to report with",
         "As [`household`](household.md), from seeds that no other set has. How things are recognised was tried and "
-        "chosen on `household`; here is what that comes to, so no picture of these scenes is shown. "
-        "`report-household-no-bases-h200` is of the code before what stands on an ellipsoid had a base in trials, "
-        "`report-household-h200` of the same in another run.",
+        "chosen on `household`; here is what that comes to, so no picture of these scenes is shown.",
         "As [`household`](household.md) is, from the seeds below.",
     ),
     "published": About(
