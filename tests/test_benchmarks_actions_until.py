@@ -25,7 +25,6 @@ from mechsearch_jax.benchmarks.statistics.actions_until import (
     restricted_means,
     restricted_steps,
 )
-from mechsearch_jax.benchmarks.statistics.intervals import ratio_interval
 from mechsearch_jax.benchmarks.statistics.paired import paired
 from mechsearch_jax.benchmarks.statistics.rates import GOALS
 from mechsearch_jax.benchmarks.statistics.variants import label_variants
@@ -130,23 +129,6 @@ def times(name, steps, policy="greedy"):
         row_of(f"c2-2-{i:03d}", method, found_step=step, **(LOST if step is None else {}))
         for i, step in enumerate(steps)
     ]
-
-
-def test_a_ratio_to_what_may_be_nothing_has_no_interval():
-    assert ratio_interval([1.0, 2.0, 3.0], [-1.0, 1.0, 0.5]) is None
-    assert ratio_interval([1.0], [2.0]) is None
-    assert ratio_interval([1.0, 2.0, 3.0], [2.0, 4.0, 6.0]) == (0.5, 0.5)
-
-
-def test_the_interval_of_a_share_of_a_gap_holds_the_true_share():
-    """Scenes differ in how many actions the worse variant takes; 0.6 of the gap is closed on average."""
-    rng, held = np.random.default_rng(0), 0
-    for _ in range(200):
-        gaps = rng.gamma(2.0, 2.0, 50)
-        saved = 0.6 * gaps + rng.normal(0.0, 1.5, 50)
-        low, high = ratio_interval(saved.tolist(), gaps.tolist())
-        held += low <= 0.6 <= high
-    assert 0.88 <= held / 200 <= 0.99
 
 
 def test_differences_count_pairs_that_never_got_there():

@@ -136,25 +136,6 @@ def mean_intervals(
     return intervals
 
 
-def ratio_interval(numerators: Sequence[float], denominators: Sequence[float]) -> Interval | None:
-    """The interval of a ratio of two means over the same scenes: percentile bootstrap, by SciPy, that draws scenes.
-
-    Args:
-      numerators, denominators: the two values of each scene.
-
-    Returns:
-      Low and high; None below two scenes, or where the mean of the denominators may be 0 by its own interval: any ratio
-      is possible then.
-    """
-    pairs = np.array(sorted(zip(numerators, denominators, strict=True)), float).reshape(-1, 2).T
-    below = mean_interval(denominators, range(len(denominators)))
-    if below is None or below[0] <= 0.0 <= below[1]:
-        return None
-    # A draw may have a denominator of 0: its ratio is infinite, beyond the percentiles, since few draws have one.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return _drawn_intervals([(pairs[0], pairs[1])])[0]
-
-
 def _drawn_intervals(
     pairs: Sequence[tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]],
 ) -> list[Interval]:
