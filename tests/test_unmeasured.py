@@ -1,5 +1,7 @@
 """What was not measured: it rules no pose out, frees no place, and nothing is moved through it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,8 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.unseen_space import BORDER
 from mechsearch_jax.belief.belief import sweeps_unmeasured
 from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.geometry.superquadric import empty, pad
 from mechsearch_jax.images.cloud import thinned_view, view
 from mechsearch_jax.images.measured import measured_share, sampled, share_step
@@ -183,3 +187,17 @@ def test_where_the_target_can_be_nowhere_nothing_is_moved(problem, whole):
     belief = belief.replace(exists=jnp.zeros_like(belief.exists))
     decision = ms.search_for_grasp()(jax.random.key(0), problem, belief, whole)
     assert int(decision.action.kind) == ActionKind.NONE
+
+
+@pytest.mark.parametrize("step", [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)])
+def test_a_target_in_sight_without_depth_may_be_where_it_is_between_the_poses(problem, step):
+    """Its nearest poses show a strip beside the hole that it makes."""
+    middle = problem.poses[9 * problem.target.grid[1] + 22, :2] + jnp.array(step) * problem.cell
+    target = dataclasses.replace(SCENE.target, position=(*map(float, middle), SCENE.target.position[2]))
+    scene = dataclasses.replace(SCENE, objects=(), target=target)
+    image = observe(problem.camera, from_scenario(scene), problem.shelf)
+    depth = np.where(np.asarray(image.segmentation) == TARGET, np.nan, np.asarray(image.depth))
+    belief = look(problem, seen(problem, empty(8), depth))
+    assert bool(belief.exists[nearest(problem, middle)])
+    # And hardly elsewhere.
+    assert int(jnp.sum(belief.exists)) < 40

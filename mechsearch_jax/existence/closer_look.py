@@ -32,6 +32,8 @@ DOUBTFUL = 16
 CLOSER_PLACES = 3
 # Factor by which a count at a third of the camera's resolution may be wrong.
 CLOSER_TOLERANCE = 1.5
+# A target may show one pixel more for so many of its pixels that would not be measured.
+BESIDE = 4
 # Multiple of the detector's threshold above which a target cannot be missed: neither by a sensor that measures only a
 # third of its pixels, nor beside an object that is recognised 5 mm too narrow on one side.
 PLAIN = 3.0
@@ -56,7 +58,8 @@ def allowances(
 
     By default the detector's threshold; more if no place of a pose shows so few pixels, but a closer look at the
     present scene shows that the target is hidden; and more where only a part of its pixels would be measured, since the
-    detector counts measured ones.
+    detector counts measured ones; and a quarter of those that would not be, since beside a hole of the target's own
+    shape the places nearest to it show a strip.
 
     Args:
       tables: constants of the problem.
@@ -70,14 +73,15 @@ def allowances(
     coarse, everywhere = camera.scaled(config.step(camera)), jnp.ones(tables.corner.shape[0], bool)
     seen: Float[Array, "x s"] | float = 1.0
     bound = jnp.full(tables.corner.shape[:2], config.allowed(camera), jnp.int32)
+    bodies = render.merge_windows(coarse, views.windows)
     if measured is not None:
         seen = measured_of_target(tables, coarse, measured, everywhere)
         unseen = found_pixels(camera, config.found_pixels) / config.step(camera) ** 2
-        bound = jnp.floor(unseen / seen).astype(jnp.int32)
+        shown = [shown_pixels(tables, coarse, image, everywhere) for image in (bodies, veiled(bodies, measured))]
+        bound = jnp.maximum(jnp.floor(unseen / seen).astype(jnp.int32), (shown[0] - shown[1]) // BESIDE)
     if config.criterion != "detector" or not config.closer_look:
         return bound
-    image = veiled(render.merge_windows(coarse, views.windows), measured)
-    shown = shown_pixels(tables, coarse, image, everywhere)
+    shown = shown_pixels(tables, coarse, veiled(bodies, measured), everywhere)
     is_free = free(views, everywhere)
     settled = jnp.any(is_free & (shown <= bound), axis=1)
     doubtful = is_free & ~settled[:, None] & (shown > bound) & (shown <= DOUBTFUL)
