@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import ConvexHull
@@ -144,7 +143,7 @@ class _DroppingWorld(NativeWorld):
     """A world in which friction gives way a little and does not act against rolling, as when the scene sets were
     recorded: poses to the micrometre, and with them all recorded scenes, depend on it."""
 
-    def _model_for(self, bodies: list[Body | None]) -> mujoco.MjModel:
+    def _model_for(self, bodies: list[Body | None]) -> Any:
         model = copy.copy(super()._model_for(bodies))
         model.opt.impratio, model.geom_condim[:] = 10.0, 4
         return model
