@@ -12,8 +12,8 @@ from recordings import LOST, MOVES, OBJECTS, RECORDING, SAMPLED, WORLD
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.page.ending import Ending, ending
 from mechsearch_jax.envs.recording.recording import NAME, save_recording
+from mechsearch_jax.envs.recording.step_values import Ending
 from mechsearch_jax.envs.viewer.shown import card, shown_steps
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.robot.arm_clearance import link_poses
@@ -150,23 +150,20 @@ def test_the_map_is_shown_from_above_and_lies_open_in_the_window(viewer, server)
     assert ((enters > leaves) | (enters > 1)).mean() > 0.9
 
 
-def test_a_card_says_why_the_target_was_lost_and_what_blocks_it(another_server):
+def test_a_panel_shows_the_values_and_what_blocks_the_target(another_server):
     from mechsearch_jax.envs.viewer.viewer import Viewer
 
     server = another_server
     lost = Viewer.of(LOST, server, FPS)
-    for sentence in ending(LOST).sentences:
-        assert sentence in lost.ended
     assert "Lost: found, but not graspable" in lost.ended
     lost.show(0)
-    assert "J: 100 before, 60 expected, 95 observed" in lost.text
-    assert "runner-up, refused after its trial: push object 0 by 20 cm" in lost.evidence
-    assert "harm: something fell off the board" in lost.evidence
-    assert "refused" in lost.evidence
+    assert "100.0 before, 60.0 predicted, 95.0 measured" in lost.text
+    assert "next best" in lost.evidence
+    assert "did harm: something fell" in lost.evidence
     assert "90 %" in lost.evidence
     assert node(server, "/blocked/0/0") is None
     lost.show(first_row(lost, 1))
-    assert "hits object 0" in lost.text
+    assert "all hit object 0" in lost.text
     marked = np.asarray(node(server, "/blocked/1/0").vertices)
     assert (np.ptp(marked, axis=0) > 2 * np.asarray(OBJECTS.size[0])).all()
     assert node(server, "/blocked/1").visible
@@ -176,7 +173,7 @@ def test_a_card_says_why_the_target_was_lost_and_what_blocks_it(another_server):
 
 def test_words_are_escaped():
     evil = "<script>alert(1)</script>"
-    assert evil not in card(Ending(False, evil, [evil], ()), [evil])
+    assert evil not in card(Ending(False, evil, evil))
 
 
 def test_time_goes_on_while_it_is_played_and_ends(viewer):

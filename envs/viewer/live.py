@@ -11,24 +11,23 @@ Nobody knows the true shapes there: what is shown is what was recognised, and th
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import logging
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
 import jax
 import numpy as np
 
-from mechsearch_jax.envs.page import steps as texts
-from mechsearch_jax.envs.page.ending import Ending
-from mechsearch_jax.envs.page.pictures import Painter, is_known
 from mechsearch_jax.envs.recording.body_solids import body_solids, moved
 from mechsearch_jax.envs.recording.evidence import evidence_without_truth
 from mechsearch_jax.envs.recording.playback import Playback
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording, empty_trace
 from mechsearch_jax.envs.recording.sampled import sampled
+from mechsearch_jax.envs.recording.step_pictures import Painter
+from mechsearch_jax.envs.recording.step_values import Ending, recognised_shapes, step_values
 from mechsearch_jax.envs.viewer.shown import ShownStep, shown_step
 from mechsearch_jax.envs.viewer.stage import VISIBLE
 from mechsearch_jax.envs.viewer.viewer import Viewer
@@ -131,7 +130,7 @@ class LiveView:
         first = self._viewer.count
         self._viewer.add([shown], played)
         self._steps, self._time = steps, float(played.time[-1]) + 1 / self._fps
-        self._viewer.end(Ending(None, f"Searching: step {len(steps)}", [step.reason], ()))
+        self._viewer.end(Ending(None, f"Searching: step {len(steps)}", step.reason))
         self._viewer.show(first)
         self._viewer.play(len(played.time) > 1)
 
@@ -139,11 +138,11 @@ class LiveView:
         if self._viewer is None:
             return
         if not ok:
-            how = Ending(None, "Broken off", [f"The motion did not come to its end: {step.reason}"], ())
+            how = Ending(None, "Broken off", f"The motion did not come to its end: {step.reason}")
         elif step.kind == "retrieve":
-            how = Ending(True, "Retrieved", [f"The target was taken out by action {step.index + 1}."], ())
+            how = Ending(True, "Retrieved", f"The target was taken out by action {step.index + 1}.")
         else:
-            how = Ending(None, f"Action {step.index + 1} is over", [step.reason], ())
+            how = Ending(None, f"Action {step.index + 1} is over", step.reason)
         self._viewer.end(how)
 
 
@@ -198,7 +197,7 @@ def believed_world(scene: Superquadrics, pose: np.ndarray, target: Target, shelf
         target.half_size,
         (x, y, target.height(shelf)),
         ((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)),
-        is_known(pose),
+        bool(np.isfinite(pose).all()),
     )
     objects = (kind, scene.size, scene.position, scene.rotation, scene.valid)
     whole = [np.concatenate([np.asarray(a), np.asarray(b)[None]]) for a, b in zip(objects, stands, strict=True)]
@@ -231,9 +230,11 @@ def _shown(steps: Sequence[RecordedStep], step: SearchStep) -> ShownStep:
     """What is shown of the last step."""
     problem, recorded = step.problem, steps[-1]
     recording = Recording("", problem.camera, problem.shelf, problem.target, tuple(steps))
-    words: dict[str, Any] = {"why": step.reason, "warnings": step.warnings, "shapes": texts.recognised(recorded)}
-    words |= {} if step.trajectory is not None else {"heading": "nothing to be done"}
-    shown = shown_step(recording, len(steps) - 1, step.frame, Painter(recording), words)
+    values = step_values(recording, len(steps) - 1)
+    heading = values.heading if step.trajectory is not None else "nothing to be done"
+    shapes = recognised_shapes(recorded)
+    values = dataclasses.replace(values, heading=heading, warnings=step.warnings, shapes=shapes)
+    shown = shown_step(recording, len(steps) - 1, step.frame, Painter(recording), values, step.reason)
     if recorded.world.valid[TARGET]:
         pose = (np.asarray(a[TARGET]) for a in (recorded.world.rotation, recorded.world.position))
         solids = [moved(solid, *pose) for solid in body_solids(recorded.world)[TARGET]]

@@ -1,23 +1,19 @@
-"""What the viewer shows of each step of a recording: pictures, meshes and words, the latter those of the page."""
+"""What the viewer shows of each step of a recording: pictures, meshes and values."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from mechsearch_jax.envs.page import steps as texts
-from mechsearch_jax.envs.page.ending import Ending
-from mechsearch_jax.envs.page.page import environment, step_words
-from mechsearch_jax.envs.page.pictures import Painter, Picture, colour_of
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.recording.shown_decisions import Ghost, ShownDecision, shown_decision
+from mechsearch_jax.envs.recording.step_pictures import Painter, Picture, colour_of
+from mechsearch_jax.envs.recording.step_values import Ending, StepValues, confidence, environment, step_values
 from mechsearch_jax.viz import drawing, web
 from mechsearch_jax.viz.blockers import MARK
 from mechsearch_jax.viz.filmstrip import Frame
@@ -34,7 +30,8 @@ class ShownStep:
     """What is shown of a step.
 
     Attributes:
-      words: by the names of the templates; see `page.step_words`.
+      values: what the recording holds of it.
+      why: the reason of the decision, in one line.
       recorded: the step.
       decision: meshes, and what the camera saw.
       above: the shelf from above with f and g.
@@ -43,7 +40,8 @@ class ShownStep:
       blocked: the marks of the objects that the best grasps of a found target hit.
     """
 
-    words: Mapping[str, Any]
+    values: StepValues
+    why: str
     recorded: RecordedStep
     decision: ShownDecision
     above: Picture
@@ -54,16 +52,16 @@ class ShownStep:
     @property
     def title(self) -> str:
         """The step's number and what is done."""
-        return f"{self.words['number']}. {self.words['heading']}"
+        return f"{self.values.number}. {self.values.heading}"
 
     def text(self, examined: str = "") -> str:
         """What was believed and decided, as HTML; `examined` is the candidate whose prediction is shown."""
-        return str(_panel().step({**self.words, "examined": examined}))
+        return str(_panel().step(self.values, self.why, examined))
 
     @property
     def evidence(self) -> str:
         """Candidates, trials and what perception saw, as HTML."""
-        return str(_panel().evidence(self.words))
+        return str(_panel().evidence(self.values))
 
 
 def shown_steps(recording: Recording) -> list[ShownStep]:
@@ -78,7 +76,8 @@ def shown_step(
     i: int,
     frame: Frame,
     painter: Painter,
-    words: Mapping[str, Any] | None = None,
+    values: StepValues | None = None,
+    why: str | None = None,
 ) -> ShownStep:
     """What is shown of a step.
 
@@ -87,21 +86,21 @@ def shown_step(
       i: index of the step.
       frame: its picture.
       painter: of the recording.
-      words: replace those of `step_words` of the same names.
+      values: of the step; those of the recording if left out.
+      why: the reason of the decision; that of the frame's caption if left out.
     """
-    step, before = recording.steps[i], recording.steps[i - 1] if i else None
-    # Before that, a caption says what the belief's words say.
-    why = frame.caption.partition(" · ")[2]
-    every = {"why": why, "warnings": (), **step_words(recording, i, frame), **(words or {})}
-    blocked, sure = texts.blocked(step), texts.confidence(step)
+    step, sure = recording.steps[i], confidence(recording.steps[i])
+    values = step_values(recording, i) if values is None else values
     return ShownStep(
-        words=every,
+        values=values,
+        # Before that, a caption says what the belief's values say.
+        why=frame.caption.partition(" · ")[2] if why is None else why,
         recorded=step,
         decision=shown_decision(step, frame, recording, painter.room),
-        above=painter.believed(step, frame, before, blocked),
-        perceived=painter.recognised(step, frame, sure) if every["shapes"] else None,
+        above=painter.believed(step, frame, values.blocked),
+        perceived=painter.recognised(step, frame, sure) if values.shapes else None,
         recognised=[(name, mesh, colour_of(float(sure[int(name)])), 0.45) for name, mesh in _meshes(step)],
-        blocked=[(name, mesh, MARK, 0.5) for name, mesh in _meshes(step, OFF) if int(name) in blocked],
+        blocked=[(name, mesh, MARK, 0.5) for name, mesh in _meshes(step, OFF) if int(name) in values.blocked],
     )
 
 
@@ -111,9 +110,9 @@ def _meshes(step: RecordedStep, off: float = 0.0) -> list[tuple[str, web.Mesh]]:
     return [(str(i), mesh) for i, mesh in enumerate(web.meshes_of(larger)) if mesh is not None]
 
 
-def card(end: Ending, left_out: Sequence[str] = ()) -> str:
-    """How an episode ended, and why, as HTML."""
-    return str(_panel().card(end._asdict(), left_out))
+def card(end: Ending) -> str:
+    """How an episode ended, as HTML."""
+    return str(_panel().card(end))
 
 
 def title(heading: str) -> str:
@@ -129,8 +128,6 @@ def legend() -> str:
 @functools.cache
 def _panel() -> Any:
     """The macros of the panel."""
-    templates = environment()
-    assert templates.loader is not None
-    templates.loader = jinja2.ChoiceLoader([templates.loader, jinja2.FileSystemLoader(_TEMPLATE.parent)])
+    templates = environment(_TEMPLATE.parent)
     templates.globals |= {**COLOURS, "nothing": "Nothing was compared, and there were no trials."}
     return templates.get_template(_TEMPLATE.name).module

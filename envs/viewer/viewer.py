@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mechsearch_jax.envs.page.ending import Ending, ending
-from mechsearch_jax.envs.page.page import left_out
-from mechsearch_jax.envs.page.pictures import Picture
 from mechsearch_jax.envs.recording.playback import Playback, playback
 from mechsearch_jax.envs.recording.recording import Recording
 from mechsearch_jax.envs.recording.shown_decisions import predicted, sampled_sketch
+from mechsearch_jax.envs.recording.step_pictures import Picture
+from mechsearch_jax.envs.recording.step_values import Ending, ending
 from mechsearch_jax.envs.viewer.shown import ShownStep, card, legend, shown_steps, title
 from mechsearch_jax.envs.viewer.stage import LAYERS, VISIBLE, Pose, Stage
 from mechsearch_jax.envs.world.world import World
@@ -92,7 +91,7 @@ class Viewer:
         played, steps = playback(recording, fps, speed), shown_steps(recording)
         viewer = cls(server, recording.heading, recording.camera, recording.shelf, fps, steps=steps, played=played)
         viewer.add_bodies(recording.steps[0].world)
-        viewer.end(ending(recording), left_out(recording))
+        viewer.end(ending(recording))
         return viewer
 
     def add(self, steps: Sequence[ShownStep], played: Playback) -> None:
@@ -120,14 +119,9 @@ class Viewer:
             self._moving |= self._stage.bodies(world, played)
             self.show(self.row)
 
-    def end(self, how: Ending, remarks: Sequence[str] = ()) -> None:
-        """Say how the search ended, or where it is.
-
-        Args:
-          how: in words.
-          remarks: that stand below.
-        """
-        self._card.content = card(how, remarks)
+    def end(self, how: Ending) -> None:
+        """Say how the search ended, or where it is."""
+        self._card.content = card(how)
 
     def show(self, row: int) -> None:
         """Show a moment.

@@ -69,7 +69,7 @@ def view(
 
     Args:
       episode: folder of `search --record` or `search --video`.
-      save: instead write a page that explains every decision, one file that needs no server.
+      save: instead write a page of every step's pictures and values, one file that needs no server.
       film: make the film, too, and show it in the page of --save; it stays a file of its own beside the page.
       host: address that is listened at; 0.0.0.0 is every one of this machine, for browsers on others.
       port: of the page; the next free one where it is taken.
@@ -87,12 +87,10 @@ def view(
     if film is not None:
         raise InputError("view: --film is shown in a page; give --save, too, or make it alone by mechsearch video")
     viser = import_viser()
-    check_recorded(episode)
-    from mechsearch_jax.envs.page.page import recording_with_record
+    recording = recording_of(episode)
     from mechsearch_jax.envs.viewer.viewer import Viewer
     from mechsearch_jax.problem.cache import keep_compilations
 
-    recording = recording_with_record(episode)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing"):
@@ -113,7 +111,7 @@ def _save_page(episode: Path, path: Path, film: Path | None, fps: int, speed: fl
     """Write the page of an episode's folder, and its film if one is named."""
     from rich.console import Console
 
-    from mechsearch_jax.envs.page.page import check_page_path, recording_with_record
+    from mechsearch_jax.envs.page.page import check_page_path
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.viz.movie import check_movie_path
@@ -122,8 +120,7 @@ def _save_page(episode: Path, path: Path, film: Path | None, fps: int, speed: fl
     if film is not None:
         check_movie_path(film)
         check_writable(film.parent)
-    check_recorded(episode)
-    recording = recording_with_record(episode)
+    recording = recording_of(episode)
     check_writable(path.parent)
     keep_compilations()
     console = Console(highlight=False)
@@ -159,22 +156,11 @@ def recording_of(episode: Path) -> Recording:
       InputError: there is no recording, or it cannot be read.
     """
     from mechsearch_jax.envs.recording.recording import NAME, load_recording
-
-    check_recorded(episode)
-    return load_recording(episode / NAME)
-
-
-def check_recorded(episode: Path) -> None:
-    """Check that there is a recording in an episode's folder.
-
-    Raises:
-      InputError: there is none.
-    """
-    from mechsearch_jax.envs.recording.recording import NAME
     from mechsearch_jax.runtime.files import is_file
 
     if not is_file(episode / NAME):
         raise InputError(f"{episode / NAME}: there is none; search once more with --record")
+    return load_recording(episode / NAME)
 
 
 def make_film(
@@ -196,7 +182,7 @@ def make_film(
 
 
 def make_page(recording: Recording, path: Path, console: Console, film: Path | None = None) -> None:
-    """Write the page that explains an episode, which shows a film of it if there is one.
+    """Write the page of an episode, which shows a film of it if there is one.
 
     Raises:
       InputError: it cannot be written.

@@ -56,7 +56,7 @@ class Kept:
     Attributes:
       record: also write recording.npz, what moved and what was believed, of which `mechsearch video` makes a film.
       video: make the film at once, too; it is recorded then.
-      page: write the page that explains every decision, see `mechsearch view --save`; it is recorded then.
+      page: write the page of every step's pictures and values, see `mechsearch view --save`; it is recorded then.
     """
 
     record: bool = False
