@@ -340,19 +340,19 @@ def test_episodes_are_chosen_for_what_they_show(tmp_path):
     # One variant has no picture of all of them.
     assert page.count("<img") == 1 + sum(film.drawn for film in shown)
     assert "no picture: no such scenario" in page
-    assert "explained</a>" not in page
+    assert "Every step of" not in page
     # A page beside the picture is linked.
     first = next(film for film in shown if film.drawn)
     (tmp_path / "report" / first.page).write_text("a page")
     again = films.films(rows, tmp_path / "report")
-    assert [film.explained for film in again] == [film.page == first.page for film in again]
+    assert [film.has_page for film in again] == [film.page == first.page for film in again]
     write_report(dataclasses.replace(Report.of(rows), films=again), tmp_path / "report")
     assert f'<a href="{first.page}">' in (tmp_path / "report" / "report.html").read_text()
     assert f"]({first.page})" in (tmp_path / "report" / "report.md").read_text()
     # What is there is not drawn again.
-    count, explained = len(drawn), [film.row for film in again if film.explained]
+    count, paged = len(drawn), [film.row for film in again if film.has_page]
     films.films(rows, tmp_path / "report", draw)
-    without = {episode_key(row) for _, row in chosen} - {episode_key(row) for row in explained}
+    without = {episode_key(row) for _, row in chosen} - {episode_key(row) for row in paged}
     assert {episode_key(row) for row in drawn[count:]} == without
 
 

@@ -34,6 +34,7 @@ from mechsearch_jax.envs.episode.records import record_action
 from mechsearch_jax.envs.page import page as pages
 from mechsearch_jax.envs.page.page import page, save_page, stamp
 from mechsearch_jax.envs.recording.recording import NAME, save_recording
+from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.recording.step_pictures import Painter
 from mechsearch_jax.envs.recording.step_values import ending, last_world, step_values
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
@@ -109,7 +110,7 @@ def test_a_page_shows_the_values_of_the_recording(text):
     assert f"f: {first.poses} of {first.every} poses; g: graspable at {first.graspable} of these" in words
     assert (first.cost, first.predicted, first.measured) == (100.0, 60.0, 95.0)
     assert "J: 100.0 before, 60.0 predicted, 95.0 measured" in words
-    assert "Outcome: as planned, and the target came into view" in words
+    assert "Outcome: carried out, and the target came into view" in words
     assert first.moved == ()
     assert [(c.role, c.value, c.cost, c.poses) for c in first.candidates] == [
         ("chosen", -30.0, 90.0, POSES),
@@ -123,7 +124,7 @@ def test_a_page_shows_the_values_of_the_recording(text):
     assert (last.found, last.poses, last.grasps, last.free) == (True, 1, 2, 0)
     # The second grasp hits more than the first.
     assert (last.hits, last.blocked) == (("object 0",), (0,))
-    assert "0 of 2 grasps within the arm's reach meet nothing; all hit object 0" in words
+    assert "0 of 2 grasps within the arm’s reach meet nothing; all hit object 0" in words
     assert (last.candidates, last.cost, last.outcome) == ((), None, "")
     assert "Lost: found, but not graspable" in words
     assert "actions 1 of at most 1" in words
@@ -233,6 +234,21 @@ def test_trials_that_read_alike_are_counted_and_a_retrieval_compares_nothing():
     words = Parsed(page(recording)).words
     assert "take the target out, 2 ways succeeded here, but not in every scene nearby" in words
     assert "1 of at most 1, and 1 to take it out" in words
+
+
+def test_the_best_that_moves_another_object_stands_beside_the_next_best():
+    def roles(*objects):
+        action = stacked(*(PUSH.replace(object=np.int32(i), q7=np.float32(k)) for k, i in enumerate(objects)))
+        places = [np.stack([np.asarray(a)] * len(objects)) for a in (OBJECTS.position, OBJECTS.rotation)]
+        several = Sampled(action, -np.arange(len(objects), 0.0, -1), np.full(len(objects), 90.0), *places)
+        step = dataclasses.replace(STEPS[0], sampled=several, action=several.single(0))
+        shown = step_values(dataclasses.replace(LOST, steps=(step, STEPS[1])), 0).candidates
+        return [(candidate.role, candidate.words[:13], candidate.poses) for candidate in shown]
+
+    first, second = ("chosen", "push object 0", POSES), ("next best", "push object 0", POSES)
+    assert roles(0, 0, 2, 3) == [first, second, ("best of another object", "push object 2", None)]
+    assert roles(0, 2, 0) == [first, ("next best", "push object 2", POSES)]
+    assert roles(0) == [first]
 
 
 def test_what_an_earlier_recording_lacks_is_left_out_with_a_sentence():

@@ -35,7 +35,7 @@ class Film:
       why: it is shown.
       caption: what is to be known of it.
       drawn: whether there is a picture of it.
-      explained: whether there is a page that explains it.
+      has_page: whether there is a page of it.
     """
 
     row: Row
@@ -43,7 +43,7 @@ class Film:
     why: str
     caption: str
     drawn: bool
-    explained: bool = False
+    has_page: bool = False
 
     @property
     def seed(self) -> int:
@@ -57,7 +57,7 @@ class Film:
 
     @property
     def page(self) -> str:
-        """The page that explains it, in the folder of the report."""
+        """Its page, in the folder of the report."""
         return f"{FOLDER}/{episode_key(self.row)}.html"
 
 

@@ -285,7 +285,7 @@ def _films(report: Report) -> list[Block]:
         caption = f"{report.key.short[film.method]}, seed {film.seed}: {film.caption}"
         block = Picture(film.file, caption) if film.drawn else Paragraph(caption)
         groups.setdefault(film.why, []).append(block)
-        if film.explained:
-            groups[film.why].append(Link(f"Every decision of {film.row.scenario} explained", film.page))
+        if film.has_page:
+            groups[film.why].append(Link(f"Every step of {film.row.scenario}", film.page))
     parts = [[Heading(why, 3), *films] for why, films in groups.items()]
     return [Heading("Single episodes"), *(block for part in parts for block in part)]

@@ -25,7 +25,7 @@ from mechsearch_jax.runtime.files import PathLike, read_text, replacing
 DECLARED = Path(__file__).with_name("gallery.toml")
 OUT = Path("docs/gallery")
 # Largest page, and all pages together [bytes].
-LARGEST, ALL = 3_000_000, 7_000_000
+LARGEST, ALL = 800_000, 2_000_000
 _INDEX = Path(__file__).with_name("gallery_index.md.jinja")
 _PROGRAM = (sys.executable, "-m", "mechsearch_jax.commands.main")
 _ENDED = re.compile(r"<title>[^:<]*: ([^<]*)</title>")

@@ -36,6 +36,8 @@ RESULTS = {
 }
 # Recognitions whose shapes may be wrong: the others are given the true ones.
 SEEING = ("masks", "masks-parts", "full", "full-parts")
+# An object that shows no more pixels than this counts as hidden.
+FEWEST_PIXELS = 100
 # What moved less at an action counts as where it was [m], and what tilted less as upright [rad].
 DISPLACED, TILTED = 0.01, np.deg2rad(20.0)
 # Failures that a record has as a single word.
@@ -96,7 +98,7 @@ class Shape(NamedTuple):
 
     Attributes:
       number: index of the object.
-      words: what it is taken for; "not recognised" if it is not.
+      words: what it is taken for; "hidden" or "not recognised" if it is not.
       confidence: 0 to 1; None if nothing says so.
       off: distance from the true body's middle [m]; None without one.
     """
@@ -291,8 +293,8 @@ def _candidates(step: RecordedStep) -> tuple[Candidate, ...]:
     every = range(len(step.sampled))
     chosen = [k for k in every if _same(step.action, step.sampled.single(k))][:1]
     others = [k for k in every if k not in chosen][:1]
-    elsewhere = [k for k in every if step.sampled.action.object[k] != step.action.object and k not in others][:1]
-    roles = {"chosen": chosen, "next best": others, "best of another object": elsewhere}
+    elsewhere = [k for k in every if step.sampled.action.object[k] != step.action.object][:1]
+    roles = {"chosen": chosen, "next best": others, "best of another object": [k for k in elsewhere if k not in others]}
     return tuple(_candidate(step, role, k) for role, rows in roles.items() for k in rows)
 
 
@@ -337,7 +339,8 @@ def _shapes(recording: Recording, step: RecordedStep) -> tuple[Shape, ...]:
             off = float(np.linalg.norm(np.asarray(step.scene.position[i]) - truth.position[i]))
             rows.append(_shape(step, i, off if truth.valid[i] else None))
         elif truth.valid[i]:
-            rows.append(Shape(i, "not recognised", None, None))
+            shows = np.count_nonzero(np.asarray(snapshot.image.segmentation) == i) > FEWEST_PIXELS
+            rows.append(Shape(i, "not recognised" if shows else "hidden", None, None))
     return tuple(rows)
 
 
@@ -383,7 +386,7 @@ def _outcome(recording: Recording, i: int, record: Step | None) -> str:
         return _plain(record.failure)
     took = last and recording.episode is not None and recording.episode.retrieved
     came = not last and recording.steps[i + 1].found and not step.found
-    return "the target was taken out" if took else "as planned" + (", and the target came into view" if came else "")
+    return "the target was taken out" if took else "carried out" + (", and the target came into view" if came else "")
 
 
 def _warnings(recording: Recording, i: int, record: Step | None) -> tuple[str, ...]:
