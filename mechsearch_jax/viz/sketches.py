@@ -82,20 +82,6 @@ def draw_taken_target(
         _ghost(axes, flat(drawing.target_points(np.array([*path[-1, :2], pose[2]]), target, shelf)), drawing.TARGET)
 
 
-def draw_grasp(axes: Axes, flat: Flat, T: Float[np.ndarray, "4 4"], opening: float, colour: str) -> None:
-    """Draw the outline of a hand that grasps, dashed.
-
-    Args:
-      axes: with the shelf.
-      flat: maps world points to the axes.
-      T: pose of the gripper.
-      opening: distance between the fingers [m].
-      colour: of the outline.
-    """
-    for points in hand_points(T, opening):
-        _ghost(axes, flat(points), colour)
-
-
 def shown_path(sketch: Sketch, shelf: Shelf) -> Float[np.ndarray, "points 3"] | None:
     """The part of an action's path that is drawn, at most to a little in front of the shelf."""
     if sketch.path is None:
