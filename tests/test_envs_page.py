@@ -220,7 +220,7 @@ def test_a_policy_that_minds_no_cost_is_shown_none():
     steps = (dataclasses.replace(STEPS[0], sampled=flat), STEPS[1])
     values = step_values(dataclasses.replace(LOST, steps=steps, episode=episode), 0)
     assert (values.cost, values.predicted, values.measured) == (None, None, None)
-    assert {(c.value, c.cost) for c in values.candidates} == {(None, None)}
+    assert [(c.role, c.value, c.cost) for c in values.candidates] == [("chosen", None, None)]
 
 
 def test_trials_that_read_alike_are_counted_and_a_retrieval_compares_nothing():

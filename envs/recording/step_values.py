@@ -128,7 +128,7 @@ class StepValues:
       hits: where none is free, the sets of objects that grasps meet, the smallest first, in words.
       blocked: the recognised objects in the way of the best grasps of a found target.
       candidates: the chosen action and the best others.
-      compared: number of compared actions.
+      compared: number of candidate actions.
       trials: what was simulated before acting.
       shapes: what was recognised; empty where the true shapes were given.
       unexplained: share of what stands on the board that lies on no recognised shape.
@@ -287,26 +287,34 @@ def _executed(step: RecordedStep, record: Step | None) -> str:
 
 
 def _candidates(step: RecordedStep) -> tuple[Candidate, ...]:
-    """The chosen action, the next best, and the best that moves another object; none where none were compared."""
+    """The chosen action, the next best, and the best that moves another object; none where none were compared.
+
+    Of a policy that compares no costs the chosen one alone.
+    """
     if step.action is None or not kind_of(int(step.action.kind)).moves_object:
         return ()
     every = range(len(step.sampled))
     chosen = [k for k in every if _same(step.action, step.sampled.single(k))][:1]
-    others = [k for k in every if k not in chosen][:1]
-    elsewhere = [k for k in every if step.sampled.action.object[k] != step.action.object][:1]
+    compared = every if _compares(step) else ()
+    others = [k for k in compared if k not in chosen][:1]
+    elsewhere = [k for k in compared if step.sampled.action.object[k] != step.action.object][:1]
     roles = {"chosen": chosen, "next best": others, "best of another object": [k for k in elsewhere if k not in others]}
     return tuple(_candidate(step, role, k) for role, rows in roles.items() for k in rows)
 
 
+def _compares(step: RecordedStep) -> bool:
+    """Whether the policy compares costs: those of one that does not are all 0."""
+    return bool(step.sampled.value.any() or step.sampled.cost.any())
+
+
 def _candidate(step: RecordedStep, role: str, k: int) -> Candidate:
-    compares = bool(step.sampled.value.any() or step.sampled.cost.any())
     forecasts = None if step.evidence is None or step.found else step.evidence.forecasts
     row = None if forecasts is None else forecasts.of(k)
     poses = good = None
     if forecasts is not None and row is not None:
         exists, g = forecasts.existence[row], forecasts.graspability[row]
         poses, good = int(exists.sum()), int((exists & (g == 1)).sum())
-    value, cost = (float(a[k]) if compares else None for a in (step.sampled.value, step.sampled.cost))
+    value, cost = (float(a[k]) if _compares(step) else None for a in (step.sampled.value, step.sampled.cost))
     return Candidate(role, _in_words(step.sampled.single(k), step), value, cost, poses, good)
 
 
