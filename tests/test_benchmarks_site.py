@@ -294,5 +294,5 @@ def test_a_gallery_is_drawn_of_the_recordings_that_are_there(tmp_path, monkeypat
     assert "nothing is no episode of the gallery; there are easy," in capsys.readouterr().err
     monkeypatch.setattr(gallery.subprocess, "run", lambda program: types.SimpleNamespace(returncode=3))
     with pytest.raises(SystemExit):
-        gallery.main(["crowded", "--out", str(tmp_path)])
-    assert "mechsearch search crowded-shelf --out" in capsys.readouterr().err
+        gallery.main(["box", "--out", str(tmp_path)])
+    assert "mechsearch search hidden-box --out" in capsys.readouterr().err
