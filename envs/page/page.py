@@ -63,23 +63,20 @@ def page(recording: Recording, film: str = "") -> str:
       recording: of the episode.
       film: where its film lies, seen from the page; empty without one.
     """
+    template = step_values.environment(_TEMPLATE.parent).get_template(_TEMPLATE.name)
     painter = step_pictures.Painter(recording)
-    return (
-        step_values.environment(_TEMPLATE.parent)
-        .get_template(_TEMPLATE.name)
-        .render(
-            title=recording.heading.partition(":")[0] or "an episode",
-            end=step_values.ending(recording),
-            picture=_data_uri(painter.end()),
-            facts=_facts(recording),
-            steps=[_step(recording, i, painter) for i in range(len(recording.steps))],
-            recorded=recording.episode is not None,
-            film=urllib.parse.quote(film),
-            moves=not film.lower().endswith(".webp"),
-            stamp=stamp(),
-            bands=drawing.bands(),
-            target=drawing.TARGET,
-        )
+    return template.render(
+        title=recording.heading.partition(":")[0] or "an episode",
+        end=step_values.ending(recording),
+        picture=_data_uri(painter.end()),
+        facts=_facts(recording),
+        steps=[_step(recording, i, painter) for i in range(len(recording.steps))],
+        recorded=recording.episode is not None,
+        film=urllib.parse.quote(film),
+        moves=not film.lower().endswith(".webp"),
+        stamp=stamp(),
+        bands=drawing.bands(),
+        target=drawing.TARGET,
     )
 
 
@@ -104,11 +101,8 @@ def _facts(recording: Recording) -> list[tuple[str, str]]:
     acts = sum(step.action is not None for step in episode.steps)
     takes = sum(step.action is not None and step.action.kind == "retrieve" for step in episode.steps)
     moves = f"{acts - takes} of at most {episode.config.get('max_steps', 'any number')}"
-    return [
-        *facts,
-        ("objects", str(episode.objects)),
-        ("actions", moves + (f", and {takes} to take it out" if takes else "")),
-    ]
+    moves += f", and {takes} to take it out" if takes else ""
+    return [*facts, ("objects", str(episode.objects)), ("actions", moves)]
 
 
 def _step(recording: Recording, i: int, painter: step_pictures.Painter) -> dict[str, Any]:
