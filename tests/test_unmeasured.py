@@ -189,9 +189,9 @@ def test_where_the_target_can_be_nowhere_nothing_is_moved(problem, whole):
     assert int(decision.action.kind) == ActionKind.NONE
 
 
-@pytest.mark.parametrize("step", [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)])
+@pytest.mark.parametrize("step", [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (3.71, -13.43), (5.07, -6.58)])
 def test_a_target_in_sight_without_depth_may_be_where_it_is_between_the_poses(problem, step):
-    """Its nearest poses show a strip beside the hole that it makes."""
+    """Its nearest poses show a strip beside the hole that it makes; steps are of the grid, from the shelf's middle."""
     middle = problem.poses[9 * problem.target.grid[1] + 22, :2] + jnp.array(step) * problem.cell
     target = dataclasses.replace(SCENE.target, position=(*map(float, middle), SCENE.target.position[2]))
     scene = dataclasses.replace(SCENE, objects=(), target=target)

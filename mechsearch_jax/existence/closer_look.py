@@ -18,7 +18,7 @@ from mechsearch_jax.geometry.bodies import enlarged, slimmed, world_parts
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, transform
-from mechsearch_jax.images.measured import veiled
+from mechsearch_jax.images.measured import beside, veiled
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
@@ -32,8 +32,6 @@ DOUBTFUL = 16
 CLOSER_PLACES = 3
 # Factor by which a count at a third of the camera's resolution may be wrong.
 CLOSER_TOLERANCE = 1.5
-# A target may show one pixel more for so many of its pixels that would not be measured.
-BESIDE = 4
 # Multiple of the detector's threshold above which a target cannot be missed: neither by a sensor that measures only a
 # third of its pixels, nor beside an object that is recognised 5 mm too narrow on one side.
 PLAIN = 3.0
@@ -58,8 +56,8 @@ def allowances(
 
     By default the detector's threshold; more if no place of a pose shows so few pixels, but a closer look at the
     present scene shows that the target is hidden; and more where only a part of its pixels would be measured, since the
-    detector counts measured ones; and a quarter of those that would not be, since beside a hole of the target's own
-    shape the places nearest to it show a strip.
+    detector counts measured ones. Where most of it would not be, what it shows right beside that does not count: next
+    to a hole of the target's own shape, the places nearest to it show a strip.
 
     Args:
       tables: constants of the problem.
@@ -74,14 +72,17 @@ def allowances(
     seen: Float[Array, "x s"] | float = 1.0
     bound = jnp.full(tables.corner.shape[:2], config.allowed(camera), jnp.int32)
     bodies = render.merge_windows(coarse, views.windows)
+    shown = shown_pixels(tables, coarse, veiled(bodies, measured), everywhere)
     if measured is not None:
         seen = measured_of_target(tables, coarse, measured, everywhere)
         unseen = found_pixels(camera, config.found_pixels) / config.step(camera) ** 2
-        shown = [shown_pixels(tables, coarse, image, everywhere) for image in (bodies, veiled(bodies, measured))]
-        bound = jnp.maximum(jnp.floor(unseen / seen).astype(jnp.int32), (shown[0] - shown[1]) // BESIDE)
+        whole, apart = (
+            shown_pixels(tables, coarse, image, everywhere) for image in (bodies, veiled(bodies, beside(measured)))
+        )
+        strip = jnp.where(2 * shown <= whole, shown - apart, 0)
+        bound = jnp.floor(unseen / seen).astype(jnp.int32) + strip
     if config.criterion != "detector" or not config.closer_look:
         return bound
-    shown = shown_pixels(tables, coarse, veiled(bodies, measured), everywhere)
     is_free = free(views, everywhere)
     settled = jnp.any(is_free & (shown <= bound), axis=1)
     doubtful = is_free & ~settled[:, None] & (shown > bound) & (shown <= DOUBTFUL)

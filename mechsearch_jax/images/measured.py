@@ -77,6 +77,14 @@ def veiled(image: Float[Array, "h w"], share: Float[Array, "h w"] | None) -> Flo
     return image if share is None else jnp.where(unmeasured(share), 0.0, image)
 
 
+def beside(share: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """The least share that was measured of each pixel and of the four next to it."""
+    padded = jnp.pad(share, 1, constant_values=1.0)
+    across = jnp.minimum(padded[1:-1, :-2], padded[1:-1, 2:])
+    along = jnp.minimum(padded[:-2, 1:-1], padded[2:, 1:-1])
+    return jnp.minimum(share, jnp.minimum(across, along))
+
+
 def unmeasured(share: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
     """Which pixels were mostly not measured."""
     return share < MOSTLY
