@@ -31,6 +31,7 @@ from mechsearch_jax.networks.segmentation import SegmentationConfig, Segmentatio
 from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing
+from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-weights"
@@ -58,7 +59,7 @@ class Architecture:
 
 
 _CLOUD = SegmentConfig().points
-_PUSH = jax.eval_shape(
+_PUSH = in_own_settings(jax.eval_shape)(
     lambda: push_start(Shelf(), empty(2), jnp.zeros((1, 3)), jnp.zeros((4, 4)), jnp.zeros(3)),
 )
 ARCHITECTURES = {
