@@ -30,8 +30,8 @@ from mechsearch_jax.runtime.executables import Executables
 from mechsearch_jax.runtime.identity import Unidentified, identity
 from mechsearch_jax.runtime.own_settings import in_own_settings
 
-# Options with which XLA compiles twice as fast for a CPU, with the same results at the same speed. Options unknown to
-# the installed XLA are left out.
+# Options with which XLA compiles twice as fast for a CPU, with the same results at the same speed; without them LLVM
+# ends the process for some of our programs on some processors. Options unknown to the installed XLA are left out.
 CPU_OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 # Settings of JAX that change what a function is compiled to, as `XLA_FLAGS` does.
 SETTINGS = (
@@ -47,16 +47,14 @@ SETTINGS = (
 
 
 class _Keeping:
-    """Where this process keeps executables, and JAX's trace state outside of any trace."""
+    """Where this process keeps executables, and JAX's trace state outside of any trace.
+
+    Where this module is first imported inside a trace, calls go to `jax.jit` until `keep_in` is called.
+    """
 
     def __init__(self) -> None:
         self.executables: Executables | None = None
-        self.untraced: Any = None
-
-    def outside(self) -> None:
-        """Record the present trace state; call it where nothing is being traced."""
-        if self.untraced is None:
-            self.untraced = get_opaque_trace_state()
+        self.untraced: Any = get_opaque_trace_state()
 
 
 _KEEPING = _Keeping()
@@ -82,9 +80,9 @@ def kept_in() -> Path | None:
 class Kept:
     """A jitted function that can be compiled before it is called, and is looked up on disk before it is traced.
 
-    A call uses the executable that `begin` or `prepare` made; where executables are kept on disk, the first call makes
-    it. Otherwise, inside other transformations, and for arguments on another device than the first, the call goes to
-    `jax.jit`. Arguments without an identity (`runtime.identity.identity`) are compiled anew in every process.
+    A call uses the executable that `begin` or `prepare` made, or makes it. Inside other transformations, and for
+    arguments on another device than the first, the call goes to `jax.jit`. Arguments without an identity
+    (`runtime.identity.identity`) are compiled anew in every process.
     """
 
     def __init__(
@@ -141,7 +139,6 @@ class Kept:
         Raises:
           Exception: whatever tracing the function raises; a call raises it, too.
         """
-        _KEEPING.outside()
         key = self._key(args, kwargs)
         compilation: Future[Any] = Future()
         if key is None or self._loaded.setdefault(key, compilation) is not compilation:
@@ -183,7 +180,6 @@ class Kept:
     @in_own_settings
     def is_ready(self, *args: Any, **kwargs: Any) -> bool:
         """Whether `prepare` with these arguments has nothing to compile; it may still have to read a file."""
-        _KEEPING.outside()
         key = self._key(args, kwargs)
         if key is None or key in self._loaded:
             return True
@@ -228,12 +224,10 @@ class Kept:
 
     def _executable(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """The executable of a call; None if it goes to `jax.jit`."""
-        if not self._loaded and _KEEPING.executables is None:
-            return None
         key = self._key(args, kwargs)
         if key is None:
             return None
-        if key not in self._loaded and _KEEPING.executables is not None:
+        if key not in self._loaded:
             self.prepare(*args, **kwargs)
         compilation = self._loaded.get(key)
         # If compiling failed in another thread, `jax.jit` raises the error in this one.
