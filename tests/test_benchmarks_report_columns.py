@@ -375,7 +375,7 @@ def check_evidence(step, row, scenario):
     """What a recorded step foresees and what grasps of the target hit is what planner and judgement say."""
     method, weights = Method.of_options(options_of(row)), PlannerConfig().weights
     world = jax.tree.map(jnp.asarray, step.world)
-    problem = method.workcell.problem(target_of(scenario, method.workcell.target), method.problem_config)
+    problem = method.workcell.problem(target_of(scenario, method.workcell.target), method.config.problem)
     judged = judge(problem, InFullView(), weights, world, jnp.array(True))
     hits = np.asarray(judged.hits)[np.asarray(judged.feasible)]
     assert hits.any()

@@ -368,9 +368,9 @@ def test_help_names_options_with_their_defaults(capsys):
     assert not end.value.code
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--gamma FLOAT" in shown
-    assert "(default: 0.7, in preset paper and published-code 0.0)" in shown
-    assert "(default: 1, in preset paper and published-code 8, in preset best 4)" in shown
-    assert "(default: 100, in preset paper and published-code 30)" in shown
+    assert "(default: 0.7, in preset paper 0.0)" in shown
+    assert "(default: 1, in preset paper 8, in preset best 4)" in shown
+    assert "(default: 100, in preset paper 30)" in shown
     assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
 

@@ -250,7 +250,7 @@ def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
     methods = [
         Method(engine=batch),
         Method(config=PRESETS["paper"](), recognition="masks", engine=batch),
-        Method(config=PRESETS["paper"](), recognition="masks", engine=native, protocol="published-code"),
+        Method(config=PRESETS["paper"](), recognition="masks", engine=native),
         Method(recognition="full", engine=batch),
     ]
     outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]

@@ -38,12 +38,12 @@ def test_a_method_survives_the_way_to_a_worker(method):
 
 def test_options_are_flat_and_complete():
     options = METHODS[1].options()
-    assert {"policy", "recognition", "protocol", *(option.name for option in OPTIONS)} <= set(options)
+    assert {"policy", "recognition", *(option.name for option in OPTIONS)} <= set(options)
     assert options["policy"] == "my_lab.policies:Mine"
     assert options["push_distances"] == [0.05, 0.2]
     assert json.loads(json.dumps(options)) == options
     assert not any("." in name for name in options)
-    assert set(Method().options()) == {"policy", "recognition", "protocol", *(option.name for option in OPTIONS)}
+    assert set(Method().options()) == {"policy", "recognition", *(option.name for option in OPTIONS)}
 
 
 def test_episodes_from_before_an_option_run_as_they_did():

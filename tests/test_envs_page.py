@@ -30,12 +30,11 @@ from stage import HIDDEN
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.numbering import named_tried
-from mechsearch_jax.envs.episode.protocols import REACHED
-from mechsearch_jax.envs.episode.records import record_action, save_episode
+from mechsearch_jax.envs.episode.records import save_episode
 from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets, objects_in_words
 from mechsearch_jax.envs.page import page as pages
 from mechsearch_jax.envs.page.ending import ending
-from mechsearch_jax.envs.page.facts import executed_words, plain
+from mechsearch_jax.envs.page.facts import plain
 from mechsearch_jax.envs.page.page import RECORD, page, recording_with_record
 from mechsearch_jax.envs.page.pictures import Painter, hidden_behind, last_world, tried_grasp
 from mechsearch_jax.envs.page.steps import candidates, shapes
@@ -348,21 +347,6 @@ def test_a_target_that_shows_and_is_not_detected_is_said_so():
     episode = dataclasses.replace(EPISODE, failure="not found", found_step=None)
     (first, *_) = ending(dataclasses.replace(LOST, episode=episode, steps=(STEPS[0], last))).sentences
     assert re.search(r"never found\. It showed \d+ pixels at the last look and was not detected\.$", first)
-
-
-def test_the_protocol_of_the_published_code_ends_well_and_says_what_it_executed():
-    steps = (dataclasses.replace(EPISODE.steps[0], action=record_action(FAR)), EPISODE.steps[1])
-    episode = dataclasses.replace(EPISODE, failure=REACHED, graspable_step=1, steps=steps)
-    reached = dataclasses.replace(LOST, episode=episode)
-    end = ending(reached)
-    assert (end.good, end.title, end.blockers) == (True, "Graspable", ())
-    assert end.sentences[0].startswith("The target was seen after 1 action, and a grasp of it is free.")
-    assert executed_words(LOST, 0) == "push object 0 by 10 cm to the left"
-    assert executed_words(reached, 0) == "push object 0 by 20 cm to the left"
-    sentences = words(page(reached))
-    assert "Executed: push object 0 by 20 cm to the left. What was decided failed" in sentences
-    assert "Lost" not in sentences
-    assert "Executed:" not in words(page(LOST))
 
 
 def test_decisions_are_the_same_with_trials_that_are_noted(problem):

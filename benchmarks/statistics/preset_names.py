@@ -7,13 +7,13 @@ import json
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from mechsearch_jax.config.fixed import without_fixed
 from mechsearch_jax.planner import PRESETS
 
 # Options beside those of presets, with their usual values; and those whose values say what they are of.
 USUAL: Mapping[str, Any] = {
     "policy": "search-for-grasp",
     "recognition": "oracle",
-    "protocol": "strict",
     "target": "cylinder",
 }
 PLAIN = ("policy", "recognition", "target")
@@ -46,7 +46,7 @@ def preset_name(options: Mapping[str, Any], text: Any) -> PresetName | None:
     Returns:
       The name; None if the options do not tell one preset from another.
     """
-    presets = _presets()
+    options, presets = without_fixed(options), _presets()
     if any(name not in options for name in _telling()):
         return None
     deviating = {preset: _deviating(options, values) for preset, values in presets.items()}

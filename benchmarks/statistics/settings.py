@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from mechsearch_jax.config.fixed import without_fixed
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
@@ -40,7 +41,7 @@ class Settings(NamedTuple):
 
     Attributes:
       preset: the preset that differs from them in the fewest options, or one of `FORMER_STANDARDS`.
-      differing: what is not as in that preset, with search-for-grasp, true shapes and protocol strict; None is the
+      differing: what is not as in that preset, with search-for-grasp and true shapes; None is the
         value of an option that the variant does not have.
     """
 
@@ -59,7 +60,7 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
 
     An option that the row does not have is of a later version, and is taken to be as in the preset.
     """
-    names = (*PRESETS, *FORMER_STANDARDS)
+    options, names = without_fixed(options), (*PRESETS, *FORMER_STANDARDS)
     candidates = [Settings(name, _differing(options, _preset_options(name))) for name in names]
     return min(candidates, key=lambda settings: len(settings.differing))
 

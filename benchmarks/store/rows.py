@@ -245,7 +245,6 @@ EPISODE = "episode"
 _MORE = {
     **{option.name: _column(option.type) for option in PLANNER_OPTIONS if option.name not in _FIELDS},
     "simulator": pyarrow.string(),
-    "protocol": pyarrow.string(),
     EPISODE: pyarrow.string(),
 }
 SCHEMA = pyarrow.schema([*_FIELDS.items(), *_MORE.items()])

@@ -244,7 +244,6 @@ _BASELINES = (
             Variant("most-occluding", policy="most-occluding"),
             Variant("mctx", policy="mctx"),
             Variant("preset paper", {"preset": "paper"}),
-            Variant("preset published-code", {"preset": "published-code"}),
             Variant("no trials", {"rehearsal": "none"}),
             Variant("10 sequences", {"sequences": 10}),
             Variant("300 sequences", {"sequences": 300}),

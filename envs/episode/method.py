@@ -9,22 +9,22 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.config.fixed import without_fixed
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.camera.snapshot import Recogniser
 from mechsearch_jax.envs.episode.policy_numbers import mould
-from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch
-from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
+from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.target import Target
 
 # What the options of an episode hold beside the configuration's.
-_OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
+_OF_EPISODES = frozenset(("policy", "recognition", "simulator", "target", "seed"))
 
 # What is an option today, as it was in episodes that do not hold it.
 _FORMER = {"retrieval_max_yaw": math.radians(45)}
@@ -35,7 +35,7 @@ MISMATCH_PREFIX = "mismatch."
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A policy with all its settings, a recogniser, a simulator, a workcell, a protocol and a mismatch; hashable.
+    """A policy with all its settings, a recogniser, a simulator, a workcell and a mismatch; hashable.
 
     Attributes:
       name: of the policy, as `planner.policy_factory` takes it: one of `planner.POLICIES`, or the import path of
@@ -44,7 +44,6 @@ class Method:
       recognition: name of the recogniser.
       engine: name of the simulator.
       workcell: of the episodes; its target sets the resolution of candidate poses.
-      protocol: how its episodes are run and judged, one of `protocols.PROTOCOLS`.
       mismatch: how the simulated world differs from what the planner assumes.
     """
 
@@ -53,7 +52,6 @@ class Method:
     recognition: RecognitionName = "oracle"
     engine: EngineName = "NativeSimulator"
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
-    protocol: ProtocolName = "strict"
     mismatch: Mismatch = ASSUMED
 
     def policy(self) -> Policy:
@@ -66,7 +64,7 @@ class Method:
         """
         first, later = push_models(self.config.push_model, self.workcell.shelf)
         return policy_factory(self.name)(
-            self.terms.planner(self.config.planner),
+            self.config.planner,
             push_model=first,
             later_push_model=later,
             tries=self.config.rehearsal != "none",
@@ -89,16 +87,6 @@ class Method:
         """
         return recogniser(self.recognition, target, self.workcell.detector)
 
-    @property
-    def terms(self) -> EpisodeProtocol:
-        """The protocol of its episodes."""
-        return PROTOCOLS[self.protocol]
-
-    @property
-    def problem_config(self) -> ProblemConfig:
-        """The settings of its episodes' problem."""
-        return self.terms.problem(self.config.problem)
-
     def mould(self) -> Hashable:
         """A key of the programs compiled for episodes of one target.
 
@@ -108,7 +96,7 @@ class Method:
         Raises:
           InputError: as `policy`.
         """
-        shared = self.workcell, self.config.problem, self.recognition, self.engine, self.protocol
+        shared = self.workcell, self.config.problem, self.recognition, self.engine
         return *shared, self.rehearsal, self.mismatch.mould(), mould(self.policy())
 
     def check(self) -> None:
@@ -126,7 +114,7 @@ class Method:
     def options(self) -> dict[str, Any]:
         """The options that identify this method, flat and as JSON values.
 
-        They are policy, recognition, protocol, every option of the configuration by its name, and by their paths all
+        They are policy, recognition, every option of the configuration by its name, and by their paths all
         other settings that differ from the preset `standard`, the default workcell or no mismatch.
         """
         named = {".".join(option.path) for option in OPTIONS}
@@ -140,7 +128,7 @@ class Method:
             usual = dict(_settings(standard, prefix))
             settings = _settings(config, prefix)
             unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
-        identity = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
+        identity = {"policy": self.name, "recognition": self.recognition}
         return {**identity, **self.config.options(), **unusual}
 
     @classmethod
@@ -151,6 +139,7 @@ class Method:
         Raises:
           InputError: a setting is impossible, or an option or the path of a setting is unknown.
         """
+        options = without_fixed(options)
         option_names = {option.name for option in OPTIONS}
         unknown = [name for name in options if "." not in name and name not in option_names | _OF_EPISODES]
         if unknown:
@@ -167,8 +156,7 @@ class Method:
                 parts[first] = _with_setting(parts[first], rest, value)
             elif rest:
                 parts["config"] = _with_setting(parts["config"], path.split("."), value)
-        protocol = options.get("protocol", "strict")
-        return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
+        return cls(options["policy"], recognition=options["recognition"], **parts)
 
 
 def _settings(config: Config | Workcell | Mismatch, prefix: str) -> Iterator[tuple[str, Any]]:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mechsearch_jax.envs.episode.protocols import REACHED
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.known_target.in_the_way import grasps_in_words, objects_in_words
 from mechsearch_jax.envs.page.causes import cause
@@ -38,7 +37,7 @@ class Ending(NamedTuple):
     """How an episode ended.
 
     Attributes:
-      good: whether the episode reached what its protocol asks for; None if nothing says so.
+      good: whether the target was taken out; None if nothing says so.
       title: in a few words.
       sentences: what happened.
       blockers: the objects that the best grasps of the target hit; empty if none does or nothing is known.
@@ -79,9 +78,6 @@ def ending(recording: Recording) -> Ending:
         fell = "off the board" if tips else "over or off the board"
         taken = f"{_seen(episode)} and taken out of the shelf by action {len(episode.steps)}; no object fell {fell}."
         return Ending(True, "Retrieved", [taken, *tips], ())
-    if episode.failure == REACHED:
-        reached = f"{_seen(episode)}, and a grasp of it is free. The protocol of the published code ends here"
-        return Ending(True, "Graspable", [f"{reached}: nothing is taken out."], ())
     return _lost(recording, episode, tips)
 
 

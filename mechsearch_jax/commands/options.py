@@ -38,13 +38,11 @@ class EpisodeOptions:
         target's too; the others see noisy depth, "masks" with true segments; "-parts": bodies of up to four parts.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
-      protocol: how episodes are run and judged: strictly, or as the authors' published code does.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
-    protocol: Literal["strict", "published-code"] = "strict"
 
     def settings(self) -> Settings:
         """The configuration file's settings, overridden by the options that are given.
@@ -82,8 +80,7 @@ class EpisodeOptions:
             sys.path.append("")
         settings, mismatch = self.settings(), self.mismatch()
         methods = [
-            Method(name, settings.config, self.recognition, engine, settings.workcell, self.protocol, mismatch)
-            for name in policies
+            Method(name, settings.config, self.recognition, engine, settings.workcell, mismatch) for name in policies
         ]
         for method in methods:
             method.check()

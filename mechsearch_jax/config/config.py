@@ -16,13 +16,13 @@ from jaxtyping import Array
 
 from mechsearch_jax.actions.config import ActionConfig
 from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
+from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 
-Imitated = Literal["nothing", "published-code"]
 RehearsalName = Literal["none", "physics", "learning"]
 
 
@@ -53,7 +53,6 @@ class Weights(NamedTuple):
         "move_target",
         "retrieval_contact",
         "predicted_collisions",
-        "imitates",
     ),
 )
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +81,6 @@ class PlannerConfig:
       predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
         too, as in the paper; static. If False, poses that an object is moved to stay possible: a target there would be
         pushed along.
-      imitates: whose peculiarities the slots of a policy have, one of `imitation.IMITATIONS`; static.
     """
 
     gamma: float = option(0.9, "discount of later actions, above 0 and at most 1")
@@ -107,7 +105,6 @@ class PlannerConfig:
     predicted_collisions: bool = option(
         False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
     )
-    imitates: Imitated = option("nothing", "whose code is imitated where no option applies", get_args(Imitated))
 
     @property
     def weights(self) -> Weights:
@@ -126,8 +123,6 @@ class PlannerConfig:
             raise InputError(
                 f"guided_fraction {self.guided_fraction} is outside [0, 1); the default is 0.7, and 0 draws evenly"
             )
-        if self.imitates not in get_args(Imitated):
-            raise InputError(f'imitates "{self.imitates}" is unknown; use {", ".join(get_args(Imitated))}')
         for name in ("horizon", "sequences", "draws", "first_draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
@@ -198,7 +193,7 @@ class Config:
         paths = {option.name: option.path for option in OPTIONS}
         for name, value in changes.items():
             if name not in paths:
-                raise InputError(f"option {name} is unknown; there are {', '.join(paths)}")
+                raise InputError(refusal(name) or f"option {name} is unknown; there are {', '.join(paths)}")
             config = _with(config, paths[name], tuple(value) if isinstance(value, list) else value)
         return config
 

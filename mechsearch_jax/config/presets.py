@@ -73,27 +73,10 @@ def best(**changes: Any) -> Config:
     return standard(**{"draws": 4, "max_steps": 20} | changes)
 
 
-def published_code(**changes: Any) -> Config:
-    """`paper` with the peculiarities of the code that the method's authors published.
-
-    Pushes go 10 cm; later actions of a sequence are drawn in the present scene, not the predicted one; later
-    pick-and-places are predicted to move nothing; objects in the way of a grasp count a tenth in J.
-
-    Args:
-      **changes: options by name, see `Config.with_options`.
-    """
-    settings = {
-        "push_distances": (0.10,),
-        "imitates": "published-code",
-    }
-    return paper(**settings | changes)
-
-
 PRESETS: Mapping[str, Callable[..., Config]] = {
     "standard": standard,
     "paper": paper,
     "best": best,
-    "published-code": published_code,
 }
 DEFAULT_PRESET = "standard"
 

@@ -9,7 +9,6 @@ from mechsearch_jax.config.presets import (
     best,
     expanded,
     paper,
-    published_code,
     standard,
 )
 from mechsearch_jax.planner.policies import (
@@ -55,7 +54,6 @@ __all__ = [
     "paper",
     "planning_policy",
     "policy_factory",
-    "published_code",
     "random_action",
     "search_and_grasp",
     "search_for_grasp",

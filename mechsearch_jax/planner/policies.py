@@ -27,11 +27,10 @@ from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.occlusion import draw_by_occlusion, plan_by_occlusion
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
-from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted, guided_draw
+from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
@@ -96,7 +95,7 @@ class PlanningPolicy(flax.struct.PyTreeNode):
 
     Attributes:
       config: settings of the planner.
-      propose, predict, objective, drawn_in: the slots; static.
+      propose, predict, objective: the slots; static.
       plan: plans with the slots; static.
       tries: whether decisions hold alternatives for trials; static. The action does not depend on it: a grasp must hit
         nothing. But `cost` and `sequences` are then those of the plan, for where no grasp succeeds in its trial.
@@ -107,13 +106,12 @@ class PlanningPolicy(flax.struct.PyTreeNode):
     propose: Propose = flax.struct.field(pytree_node=False)
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
-    drawn_in: DrawnIn = flax.struct.field(pytree_node=False, default=as_predicted)
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
     tries: bool = flax.struct.field(pytree_node=False, default=False)
 
     def rollout(self, problem: Problem, belief: Belief) -> Rollout:
         """The engine with this policy's slots."""
-        return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective, self.drawn_in)
+        return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective)
 
     @property
     def grasps(self) -> Kept:
@@ -275,8 +273,8 @@ def planning_policy(
     """
     push_model = push_model or own_push_model("learned")
     config = dataclasses.replace(_planner_config(config), **changes)
-    slots = Slots(propose, PredictByKind(push_model, later_push_model or push_model), objective)
-    return PlanningPolicy(config=config, tries=tries, **IMITATIONS[config.imitates](slots)._asdict())
+    predict = PredictByKind(push_model, later_push_model or push_model)
+    return PlanningPolicy(config, propose, predict, objective, tries=tries)
 
 
 # Minimises f and g together while it searches (equation 2).

@@ -29,7 +29,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
-from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
+from mechsearch_jax.planner.proposal import Propose
 from mechsearch_jax.planner.state import Decision, Sequences, State
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import found_hits
@@ -100,8 +100,7 @@ class Rollout:
     Attributes:
       problem, belief: constants of the search, and the present belief.
       config: settings of the planner.
-      propose, predict, objective, drawn_in: the slots.
-      present: the scene in which sequences begin; None outside of sequences.
+      propose, predict, objective: the slots.
     """
 
     problem: Problem
@@ -110,8 +109,6 @@ class Rollout:
     propose: Propose
     predict: Predict
     objective: Objective
-    drawn_in: DrawnIn = as_predicted
-    present: Superquadrics | None = None
 
     def root(self, objects: Superquadrics) -> State:
         """`present_state` of the rollout's problem and belief."""
@@ -143,10 +140,9 @@ class Rollout:
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, hits_at_found]))
 
     def candidates(self, state: State, moved: Bool[Array, " n"]) -> AllCandidates:
-        """Candidate actions where an action of a state is drawn, brought up to date after some objects moved."""
+        """Candidate actions of a state, brought up to date after some objects moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        scene = self.drawn_in(self.present, state).scene
-        return all_candidates(self.problem.space, scene, possible, state.candidates, moved, state.able)
+        return all_candidates(self.problem.space, state.scene, possible, state.candidates, moved, state.able)
 
     def up_to_date(self, state: State) -> State:
         """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
@@ -158,8 +154,7 @@ class Rollout:
         return self.objective.cost(self.problem, self.belief, state, self.config.weights)
 
     def _proposed(self, state: State, key: Array) -> Sample:
-        drawn_in = self.drawn_in(self.present, state)
-        return self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, drawn_in)
+        return self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, state)
 
     def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
         sample = self._proposed(state, key)
@@ -202,8 +197,7 @@ class Rollout:
         space that was not measured.
         """
         possible = possible_space(self.problem, self.belief, state.exists)
-        scene = self.drawn_in(self.present, state).scene
-        return contact_probability(self.problem.space, scene, possible, sample)
+        return contact_probability(self.problem.space, state.scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """Advance all sequences by one action: the states after it, and records of the states before it."""
@@ -286,7 +280,6 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     config = rollout.config
     count, horizon = config.sequences, config.horizon
     root = rollout.root(objects)
-    rollout = dataclasses.replace(rollout, present=root.scene)
     states = repeated(root, count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
     _, (actions, cost, penalty, scenes) = jax.lax.scan(
