@@ -43,7 +43,7 @@ from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
 ROW = Row("a", 2, "cylinder", METHODS[1], "oracle", 0.9, 3, 30, "push+pick-and-place", 0, 1, 2, True, 3, None, 1.5, 0.6)
-FOR = Setting(METHODS[1], "masks", BOTH, "paper", "strict")
+FOR = Setting(METHODS[1], "masks", BOTH, "paper")
 AND = FOR._replace(method=METHODS[0])
 
 
@@ -219,7 +219,7 @@ def test_a_dry_run_says_what_it_would_be(run, tmp_path):
     jobs, printed = run("table1", "--scenes", "2", "--objects", "2", "8", "--preset", "standard", "--dry-run")
     assert not jobs
     assert not (tmp_path / "rows").exists()
-    assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, strict, any" in printed.out
+    assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, any" in printed.out
     assert "6 variants, 24 episodes, 0 of them there already, 24 left" in printed.out
     assert re.search(r"^  standard, full, with trials, native simulator: 8 x [\d.]+ s, 2 x ", printed.out, re.M)
 

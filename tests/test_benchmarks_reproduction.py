@@ -209,15 +209,15 @@ def test_a_finding_of_one_method_alone_says_so(tmp_path):
 
 
 def test_tables_have_no_columns_that_say_nothing(tmp_path):
-    rows = rows_of("table1", 3, lambda *_: (1, 2), retrieved=None, objects_fallen=None)
+    rows = rows_of("table1", 3, lambda *_: (1, 2), objects_fallen=None)
     stored(tmp_path, "table1", rows)
     stored(tmp_path, "table4", rows_of("table4", 3, lambda *_: (1, 2)))
     page = reproduction_page.page(tmp_path)
     assert "Rows: [table4](../benchmarks/results/runs/table4.jsonl); NativeSimulator." in page
     before, _, after = page.partition("## Table 4")
     assert (
-        "| recognition | method | objects | episodes | found | paper | graspable | paper | with the paper's grasps |\n"
-        in before
+        "| recognition | method | objects | episodes | found | paper | graspable | paper | with the paper's grasps | "
+        "retrieved |\n" in before
     )
     assert "| recognition | method | actions | objects | episodes |" in after
     stored(tmp_path, "table3", rows_of("table3", 3, lambda *_: (1, 2), preset="standard"))
@@ -235,12 +235,10 @@ def test_another_folder_is_no_page_without_runs(tmp_path, capsys):
 
 def test_variants_that_are_no_cells_are_left_out():
     line = {"preset": "paper", "settings": {"policy": METHODS[0], "recognition": "masks", "actions": list(PUSH)}}
-    assert setting_of(line) == Setting(METHODS[0], "masks", PUSH, "paper", "strict")
+    assert setting_of(line) == Setting(METHODS[0], "masks", PUSH, "paper")
     assert setting_of({**line, "settings": {"gamma": 0.5}}) is None
     assert setting_of({**line, "settings": {"policy": "random"}}) is None
-    assert setting_of({"preset": "standard", "settings": {}}) == Setting(
-        METHODS[1], "oracle", BOTH, "standard", "strict"
-    )
+    assert setting_of({"preset": "standard", "settings": {}}) == Setting(METHODS[1], "oracle", BOTH, "standard")
 
 
 def test_the_newest_run_of_a_cell_counts():

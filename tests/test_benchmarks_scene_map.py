@@ -48,11 +48,11 @@ def test_variants_are_called_by_their_presets_and_what_deviates():
     changed = dataclasses.replace(
         USUAL,
         name="random",
-        config=PRESETS["best"](gamma=0.5),
+        config=PRESETS["paper"](gamma=0.5),
         mismatch=Mismatch(friction=0.5),
     )
     name = preset_name(changed.options(), str)
-    assert name.preset == "best"
+    assert name.preset == "paper"
     assert set(name.deviations.split(", ")) == {"gamma 0.5", "random", "friction 0.5"}
 
 

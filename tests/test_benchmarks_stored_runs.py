@@ -110,7 +110,7 @@ def test_every_preset_is_its_own_settings():
         assert settings_of(options) == (name, {})
         assert settings_of({**options, "gamma": 0.5}) == (name, {"gamma": 0.5})
     later = Method().options()
-    del later["crowding_weight"]
+    del later["move_target"]
     assert settings_of(later) == ("standard", {})
 
 
@@ -146,7 +146,7 @@ def test_twenty_thousand_rows_are_small(tmp_path):
         )
         for row in usual
         for objects in (2, 4, 6, 8)
-        for number in range(180)
+        for number in range(360)
     ]
     files = write_run(run_of("large", rows), tmp_path)
     assert len(rows) == 17_280

@@ -327,13 +327,13 @@ def test_what_is_given_goes_before_the_preset(preset):
 
 def test_actions_go_by_the_name_of_a_set():
     standard, paper = PRESETS["standard"]().options(), PRESETS["paper"]().options()
-    names = ("actions", "push_directions", "push_distances", "object_grasp_tilts", "object_grasp_max_yaw")
+    names = ("actions", "push_directions", "push_distances")
     of_paper = {name: paper[name] for name in names}
     assert of_paper != {name: standard[name] for name in names}
     assert options_of("--actions", "paper").settings().config == PRESETS["standard"](**of_paper)
     assert options_of("--preset", "paper", "--actions", "paper").settings().config == PRESETS["paper"]()
-    given = options_of("--actions", "paper", "--push-distances", "0.2", "--draws", "3")
-    assert given.settings().config == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "draws": 3})
+    given = options_of("--actions", "paper", "--push-distances", "0.2", "--horizon", "3")
+    assert given.settings().config == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "horizon": 3})
     with pytest.raises(InputError, match="actions: paper is a whole set of actions; give it alone"):
         options_of("--actions", "push", "paper").settings()
 
@@ -368,8 +368,7 @@ def test_help_names_options_with_their_defaults(capsys):
     assert not end.value.code
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--gamma FLOAT" in shown
-    assert "(default: 0.7, in preset paper 0.0)" in shown
-    assert "(default: 1, in preset paper 8, in preset best 4)" in shown
+    assert "(default: physics, in preset paper none)" in shown
     assert "(default: 100, in preset paper 30)" in shown
     assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)

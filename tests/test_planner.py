@@ -1,6 +1,7 @@
 """The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
 
 import dataclasses
+import itertools
 import json
 
 import jax
@@ -104,36 +105,24 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "gamma": 0.9,
         "horizon": 1,
         "sequences": 100,
-        "unseen_contact_penalty": 1.0,
-        "guided_fraction": 0.7,
-        "crowding_weight": 0.02,
-        "draws": 1,
-        "first_draws": 4,
-        "move_again": False,
         "move_target": False,
         "retrieval_contact": True,
-        "predicted_collisions": False,
-        "imitates": "nothing",
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
-        "avoid_unseen": True,
-        "object_grasp_tilts": pytest.approx(np.radians([10, 20, 30]).tolist()),
-        "object_grasp_max_yaw": pytest.approx(np.radians(90)),
-        "criterion": "detector",
-        "cell_reach": [1.0],
-        "closer_look": 3,
-        "erosion": 0.0,
-        "reopen": True,
-        "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
-        "grasp_max_yaw": pytest.approx(np.radians(45)),
-        "retrieval_tilts": pytest.approx(np.radians([20, 25, 30]).tolist()),
-        "retrieval_max_yaw": pytest.approx(np.radians(75)),
         "push_model": "learned",
         "rehearsal": "physics",
         "max_steps": 10,
     }
     # What is no option.
+    search, problem = PlannerConfig(), planner.standard().problem
+    assert (search.unseen_contact_penalty, search.guided_fraction, search.crowding_weight) == (1.0, 0.7, 0.02)
+    assert search.draws == (4, 1)
+    assert not any(settings.as_in_paper for settings in (search, problem.existence, problem.actions))
+    degrees = [(20, 25, 30), 45, (20, 25, 30), 75, (10, 20, 30), 90]
+    angles = [(grasps.tilts, grasps.max_yaw) for grasps in (problem.grasps, problem.retrieval, problem.actions.grasps)]
+    for given, expected in zip(itertools.chain(*angles), degrees, strict=True):
+        np.testing.assert_allclose(np.degrees(given), expected)
     assert (ActionConfig().contact_tolerance, ActionConfig().topple) == (0.003, 0.5)
     assert (QuasiStatic().max_penetration, LearnedPush().max_penetration) == (0.006, 0.026)
     assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 41)
@@ -145,11 +134,11 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     search, actions = config.planner, config.problem.actions
     assert (search.horizon, search.sequences, config.max_steps) == (3, 30, 10)
     assert (search.guided_fraction, search.unseen_contact_penalty, search.crowding_weight) == (0.0, 0.0, 0.0)
-    assert (search.move_again, search.predicted_collisions) == (True, True)
     assert not search.move_target
-    assert search.draws > search.first_draws == 1
-    assert (config.problem.existence.erosion, config.problem.existence.reopen) == (0.0, False)
-    assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
+    assert search.draws == (8, 8)
+    assert search.as_in_paper
+    assert config.problem.existence.as_in_paper
+    assert actions.as_in_paper
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
     assert actions.push_directions == (np.pi / 2, -np.pi / 2)
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
@@ -159,11 +148,6 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     # Where the paper is silent.
     assert search.gamma == planner.standard().planner.gamma
     assert planner.paper(gamma=0.5).planner.gamma == 0.5
-
-
-def test_the_best_preset_is_the_standard_with_more_draws_and_actions():
-    assert planner.best() == planner.standard(draws=4, max_steps=20)
-    assert planner.best(max_steps=10, gamma=0.8) == planner.standard(draws=4, gamma=0.8)
 
 
 def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
@@ -233,10 +217,9 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         alive = jax.vmap(lambda key: rollout.act(jnp.array(first), root, key)[0]["alive"])(keys)
         return float(jnp.mean(alive))
 
-    for draws, first_draws, first, later in ((1, 1, 1, 1), (1, 4, 4, 1), (3, 1, 3, 3), (2, 4, 4, 2)):
-        changes = {"draws": draws, "first_draws": first_draws}
-        assert share(True, **changes) == pytest.approx(1 - 0.7**first, abs=0.03)
-        assert share(False, **changes) == pytest.approx(1 - 0.7**later, abs=0.03)
+    for as_in_paper, first, later in ((False, 4, 1), (True, 8, 8)):
+        assert share(True, as_in_paper=as_in_paper) == pytest.approx(1 - 0.7**first, abs=0.03)
+        assert share(False, as_in_paper=as_in_paper) == pytest.approx(1 - 0.7**later, abs=0.03)
 
 
 @pytest.mark.parametrize("on_cpu", [True, False])
@@ -256,8 +239,7 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
         possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *seen, vmap_method="broadcast_all")
         return Prediction(state.scene, state.scene.valid, possible)
 
-    config = dataclasses.replace(CONFIG, draws=1, first_draws=draws)
-    rollout = Rollout(problem, planner.initial_belief(problem), config, counts, seldom, POLICY.objective)
+    rollout = Rollout(problem, planner.initial_belief(problem), CONFIG, counts, seldom, POLICY.objective)
     keys = jax.random.split(jax.random.key(0), rows)
     # The last is a sequence that has ended.
     states = repeated(root, rows).replace(alive=jnp.arange(rows) < rows - 1)
@@ -282,7 +264,7 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
 
 
 def test_options_are_changed_by_name_and_survive_json():
-    config = planner.standard(gamma=0.5, criterion="depth-mse", push_distances=(0.05, 0.2), max_steps=3)
+    config = planner.standard(gamma=0.5, push_model="quasi-static", push_distances=(0.05, 0.2), max_steps=3)
     again = planner.Config().with_options(**json.loads(json.dumps(config.options())))
     assert again == config
     with pytest.raises(InputError, match="option focus is unknown; there are gamma, "):
@@ -511,7 +493,7 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
 
     policy = dataclasses.replace(
         POLICY,
-        config=dataclasses.replace(CONFIG, unseen_contact_penalty=0.5, first_draws=1),
+        config=dataclasses.replace(CONFIG, unseen_contact_penalty=0.5),
         propose=somewhere,
         predict=lambda _, state, *__: Prediction(state.scene, state.scene.valid, jnp.array(True)),
     )
@@ -568,16 +550,14 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"gamma": 1.5}, "gamma 1.5"),
         ({"horizon": 0}, "horizon 0 must be at least 1"),
         ({"sequences": 0}, "sequences 0"),
-        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
-        ({"guided_fraction": -0.1}, "0 draws evenly"),
-        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
-        ({"unseen_contact_penalty": float("nan")}, "unseen_contact_penalty nan"),
-        ({"imitates": "me"}, 'imitates "me" is unknown; use nothing, published-code'),
-        ({"draws": 0}, "draws 0 must be at least 1"),
-        ({"first_draws": 0}, "first_draws 0 must be at least 1"),
+        ({"guided_fraction": 0.5}, "guided_fraction is no option any more: it is fixed at 0.7 .in preset paper at 0.0"),
+        ({"imitates": "me"}, "imitates is no option any more: it is fixed at nothing; leave it out"),
+        (
+            {"grasp_tilts": (0.1,)},
+            r"grasp_tilts is no option any more: it is fixed at 0.3491 0.4363 0.5236 \(in preset",
+        ),
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
-        ({"criterion": "guess"}, 'criterion "guess" is unknown'),
         ({"actions": ()}, "one or more kinds of action"),
     ],
 )

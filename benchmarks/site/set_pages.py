@@ -28,7 +28,7 @@ OUT = Path("docs/scene-sets")
 MEASURES = ("retrieved", "found", "graspable")
 # What variants on a set's page may differ in; others belong to studies.
 SHOWN = ("policy", "recognition", "actions", "rehearsal", "retrieval_contact")
-_PRESETS = ("standard", *FORMER_STANDARDS, "best", "paper")
+_PRESETS = ("standard", *FORMER_STANDARDS, "paper")
 _WORDS = {
     "rehearsal=none": "without trials",
     "rehearsal=learning": "with trials that learn the friction",

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from mechsearch_jax.config.fixed import without_fixed
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
 # Options beside those of presets, with their usual values; and those whose values say what they are of.
@@ -68,7 +69,7 @@ def named_once(names: Mapping[str, PresetName | None]) -> dict[str, PresetName]:
 @functools.cache
 def _presets() -> dict[str, dict[str, Any]]:
     """The options of each preset."""
-    return {name: {**preset().options(), **USUAL} for name, preset in PRESETS.items()}
+    return {name: {**Method(config=preset()).options(), **USUAL} for name, preset in PRESETS.items()}
 
 
 @functools.cache

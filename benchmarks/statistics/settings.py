@@ -18,15 +18,15 @@ FROM_THE_FRONT = "standard until 2026-11-28"
 THREE_AHEAD = "standard until 2026-11-26"
 _RETRIEVALS_WITHIN_45 = {
     "retrieval_max_yaw": math.radians(45),
-    "retrieval_tilts": tuple(map(math.radians, (20.0, 22.5, 25.0, 27.5, 30.0))),
+    "retrieval_tilts": list(map(math.radians, (20.0, 22.5, 25.0, 27.5, 30.0))),
 }
 _FRONT_GRASPS = {
     "object_grasp_max_yaw": math.radians(45),
-    "object_grasp_tilts": (math.radians(20), math.radians(30)),
+    "object_grasp_tilts": list(map(math.radians, (20.0, 30.0))),
     **_RETRIEVALS_WITHIN_45,
 }
-# What preset `standard` was before, the latest first: by the name that it has since, the options that were other than
-# today's.
+# What preset `standard` was before, the latest first: by the name that it has since in stored results, the options that
+# were other than today's, some of which are none any more.
 FORMER_STANDARDS: Mapping[str, Mapping[str, Any]] = {
     WITHIN_45: _RETRIEVALS_WITHIN_45,
     FROM_THE_FRONT: _FRONT_GRASPS,
@@ -51,8 +51,9 @@ class Settings(NamedTuple):
 
 @functools.cache
 def _preset_options(name: str) -> Mapping[str, Any]:
-    config = PRESETS["standard"](**FORMER_STANDARDS[name]) if name in FORMER_STANDARDS else PRESETS[name]()
-    return Method(config=config).options()
+    if name in FORMER_STANDARDS:
+        return {**Method().options(), **FORMER_STANDARDS[name]}
+    return Method(config=PRESETS[name]()).options()
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:

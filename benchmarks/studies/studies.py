@@ -73,7 +73,6 @@ class Study:
       logarithmic: whether the axis is.
       by_time: whether its picture shows success against planning time.
       chooses: whether a default is chosen by it, so that its scenes are no longer ones that nothing was chosen on.
-      around: the former default around which its variants are, one of `settings.FORMER_STANDARDS`; None for today's.
     """
 
     name: str
@@ -84,7 +83,6 @@ class Study:
     logarithmic: bool = False
     by_time: bool = False
     chooses: bool = False
-    around: str | None = None
 
     @property
     def baseline(self) -> Variant:

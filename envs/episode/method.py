@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.actions.registry import check_kinds
-from mechsearch_jax.config.fixed import without_fixed
+from mechsearch_jax.config.fixed import AS_IN_PAPER, without_fixed
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.camera.snapshot import Recogniser
 from mechsearch_jax.envs.episode.policy_numbers import mould
@@ -24,10 +23,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.target import Target
 
 # What the options of an episode hold beside the configuration's.
-_OF_EPISODES = frozenset(("policy", "recognition", "simulator", "target", "seed"))
-
-# What is an option today, as it was in episodes that do not hold it.
-_FORMER = {"retrieval_max_yaw": math.radians(45)}
+_OF_EPISODES = frozenset(("policy", "recognition", AS_IN_PAPER, "simulator", "target", "seed"))
 
 # Of the paths of a mismatch's settings among the options.
 MISMATCH_PREFIX = "mismatch."
@@ -114,12 +110,13 @@ class Method:
     def options(self) -> dict[str, Any]:
         """The options that identify this method, flat and as JSON values.
 
-        They are policy, recognition, every option of the configuration by its name, and by their paths all
-        other settings that differ from the preset `standard`, the default workcell or no mismatch.
+        They are policy, recognition, whether what is no option is as in the paper, every option of the configuration by
+        its name, and by their paths all other settings that differ from the preset, `standard` or `paper`, from the
+        default workcell or from no mismatch.
         """
         named = {".".join(option.path) for option in OPTIONS}
         pairs = (
-            (self.config, PRESETS["standard"](), ""),
+            (self.config, PRESETS["paper" if self.config.planner.as_in_paper else "standard"](), ""),
             (self.workcell, Workcell(), "workcell."),
             (self.mismatch, ASSUMED, MISMATCH_PREFIX),
         )
@@ -128,13 +125,17 @@ class Method:
             usual = dict(_settings(standard, prefix))
             settings = _settings(config, prefix)
             unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
-        identity = {"policy": self.name, "recognition": self.recognition}
+        identity = {
+            "policy": self.name,
+            "recognition": self.recognition,
+            AS_IN_PAPER: self.config.planner.as_in_paper,
+        }
         return {**identity, **self.config.options(), **unusual}
 
     @classmethod
     def of_options(cls, options: Mapping[str, Any]) -> Method:
-        """The method whose `options` these are; what they do not hold is as in the preset `standard`, or as it was
-        before it was an option. It runs natively.
+        """The method whose `options` these are; what they do not hold is as in the preset, `standard` or `paper`. It
+        runs natively.
 
         Raises:
           InputError: a setting is impossible, or an option or the path of a setting is unknown.
@@ -144,11 +145,8 @@ class Method:
         unknown = [name for name in options if "." not in name and name not in option_names | _OF_EPISODES]
         if unknown:
             raise InputError(f"option {unknown[0]} is unknown to this version: what ran with it cannot be run again")
-        # An episode holds every option that there was.
-        former = _FORMER if "retrieval_tilts" in options else {}
-        config = PRESETS["standard"](
-            **former | {name: value for name, value in options.items() if name in option_names}
-        )
+        preset = PRESETS["paper" if options.get(AS_IN_PAPER) else "standard"]
+        config = preset(**{name: value for name, value in options.items() if name in option_names})
         parts: dict[str, Any] = {"config": config, "workcell": Workcell(), "mismatch": ASSUMED}
         for path, value in options.items():
             first, *rest = path.split(".")

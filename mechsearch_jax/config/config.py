@@ -15,7 +15,6 @@ import jax
 from jaxtyping import Array
 
 from mechsearch_jax.actions.config import ActionConfig
-from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
@@ -47,12 +46,9 @@ class Weights(NamedTuple):
     meta_fields=(
         "horizon",
         "sequences",
-        "draws",
-        "first_draws",
-        "move_again",
         "move_target",
         "retrieval_contact",
-        "predicted_collisions",
+        "as_in_paper",
     ),
 )
 @dataclasses.dataclass(frozen=True)
@@ -70,41 +66,35 @@ class PlannerConfig:
         other draws are uniform, as all are in the paper.
       crowding_weight: weight in J of objects that only some of a pose's grasps hit; the paper's J counts the best grasp
         of a pose alone. Small enough that no number of hits outweighs one object of the cost proper.
-      draws: how often an action is drawn until one is possible; static. The paper has no limit.
-      first_draws: the same for the first action of a sequence, if that is more; static. A first action is executed, so
-        it is worth more draws.
-      move_again: whether an object may move more than once in a sequence, as in the paper; static.
       move_target: whether a found target may be pushed, too; static. Nothing else helps if every grasp of it hits an
         object that can neither be grasped nor pushed, but that is too rare to gain anything.
       retrieval_contact: whether a grasp that hits objects may take a found target out if its trial succeeds; static.
         Not so in the paper. If False, only grasps that hit nothing are tried.
-      predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
-        too, as in the paper; static. If False, poses that an object is moved to stay possible: a target there would be
-        pushed along.
+      as_in_paper: set by preset `paper` alone; static. An object may then move more than once in a sequence, an action
+        is drawn more often until one is possible, and f rules out overlaps of the target with objects (equation 14) in
+        predicted states, too. If False, poses that an object is moved to stay possible: a target there would be pushed
+        along.
     """
 
     gamma: float = option(0.9, "discount of later actions, above 0 and at most 1")
     horizon: int = option(1, "actions in a sequence; the paper's is 3")
     sequences: int = option(100, "sequences that are sampled for a decision; the paper's is 30")
-    unseen_contact_penalty: float = option(
-        1.0, "what an action costs that may touch the unseen target, as a share of J; the paper's is 0"
-    )
-    guided_fraction: float = option(
-        0.7, "share of the sampled actions that go to objects by how much they hide or block; the paper's is 0"
-    )
-    crowding_weight: float = option(
-        0.02, "how much J minds objects that only some grasps of a pose hit; the paper's is 0"
-    )
-    draws: int = option(1, "how often an action is drawn until one is possible")
-    first_draws: int = option(4, "the same for the first action of a sequence, where that is more")
-    move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
+    unseen_contact_penalty: float = 1.0
+    guided_fraction: float = 0.7
+    crowding_weight: float = 0.02
     move_target: bool = option(False, "whether a found target may be pushed, too, as it may not in the paper")
     retrieval_contact: bool = option(
         True, "whether trials may take a found target out with a grasp that touches objects; not in the paper"
     )
-    predicted_collisions: bool = option(
-        False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
-    )
+    as_in_paper: bool = False
+
+    @property
+    def draws(self) -> tuple[int, int]:
+        """How often an action is drawn until one is possible: the first of a sequence, and a later one.
+
+        A first action is executed, so it is worth more draws. The paper has no limit: 8 is an approximation.
+        """
+        return (8, 8) if self.as_in_paper else (4, 1)
 
     @property
     def weights(self) -> Weights:
@@ -123,7 +113,7 @@ class PlannerConfig:
             raise InputError(
                 f"guided_fraction {self.guided_fraction} is outside [0, 1); the default is 0.7, and 0 draws evenly"
             )
-        for name in ("horizon", "sequences", "draws", "first_draws"):
+        for name in ("horizon", "sequences"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
 
@@ -228,12 +218,12 @@ def _with(value: Any, path: tuple[str, ...], new: Any) -> Any:
     return dataclasses.replace(value, **{path[0]: inner})
 
 
-def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option, ...]:
+def _fields(kind: type, path: tuple[str, ...]) -> tuple[Option, ...]:
     """The options among the fields of a configuration class, in their order."""
     hints = get_type_hints(kind)
     return tuple(
         Option(
-            prefix + field.name,
+            field.name,
             (*path, field.name),
             str if field.metadata["choices"] else hints[field.name],
             field.metadata["help"],
@@ -247,9 +237,5 @@ def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option
 OPTIONS: tuple[Option, ...] = (
     *_fields(PlannerConfig, ("planner",)),
     *_fields(ActionConfig, ("problem", "actions")),
-    *_fields(ObjectGraspConfig, ("problem", "actions", "grasps"), "object_grasp_"),
-    *_fields(ExistenceConfig, ("problem", "existence")),
-    *_fields(GraspConfig, ("problem", "grasps"), "grasp_"),
-    *_fields(GraspConfig, ("problem", "retrieval"), "retrieval_"),
     *_fields(Config, ()),
 )

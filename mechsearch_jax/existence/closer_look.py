@@ -79,7 +79,7 @@ def allowances(
         unseen = found_pixels(camera, config.found_pixels) / config.step(camera) ** 2
         shown = [shown_pixels(tables, coarse, image, everywhere) for image in (bodies, veiled(bodies, measured))]
         bound = jnp.maximum(jnp.floor(unseen / seen).astype(jnp.int32), (shown[0] - shown[1]) // BESIDE)
-    if config.criterion != "detector" or not config.closer_look:
+    if not config.looks_closer:
         return bound
     shown = shown_pixels(tables, coarse, veiled(bodies, measured), everywhere)
     is_free = free(views, everywhere)

@@ -77,7 +77,7 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
     """
     scene, is_target = with_target(problem, belief, objects)
     count, spread = problem.existence.T_world_target.shape[:2]
-    places = (count, spread) if config.predicted_collisions else None
+    places = (count, spread) if config.as_in_paper else None
     return State(
         scene=scene,
         is_target=is_target,
@@ -122,7 +122,7 @@ class Rollout:
             # Only the found pose counts; see `belief.without_candidates`.
             counts = self.objective.needs_graspability(self.belief, state)[-1]
             return state.replace(hits=found_hits(problem.target_grasps, grasps, objects, counts, state.hits, moved))
-        counts_collisions = state.exists if self.config.predicted_collisions else None
+        counts_collisions = state.exists if self.config.as_in_paper else None
         views = object_views(
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
         )
@@ -162,10 +162,8 @@ class Rollout:
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
         """An action and its prediction, drawn again until it is possible, at most as often as `config` allows."""
-        most = max(self.config.draws, self.config.first_draws)
-        if most == 1:
-            return self._attempt(first, state, key)
-        draws = jnp.where(first, most, self.config.draws)
+        most, later = self.config.draws
+        draws = jnp.where(first, most, later)
         attempt = lambda state, i: self._attempt(first, state, jax.random.fold_in(key, i))  # noqa: E731
         if not on_cpu():
             return _draw_all(attempt, state, draws, most)
@@ -177,7 +175,7 @@ class Rollout:
         sample, prediction = self._draw(first, state, key)
         acted = prediction.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
-        spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.move_again)
+        spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.as_in_paper)
         moved = prediction.moved & acted
         target_at = state.target_at
         if self.config.move_target:
