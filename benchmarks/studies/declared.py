@@ -17,6 +17,8 @@ ABLATION_SCENES = "development"
 # A set for each later question, since a set that was looked at is no longer unseen.
 CONFIRMATION_SCENES, DEFAULT_SCENES = "report-c", "report-d"
 STANDARD = Variant("standard")
+# Where policies to compare with are that no command has a name for.
+POLICIES = "mechsearch_jax.benchmarks.policies"
 
 
 def _degrees(*angles: int) -> tuple[float, ...]:
@@ -172,8 +174,8 @@ _BASELINES = (
             Variant("search-and-grasp", policy="search-and-grasp"),
             Variant("random", policy="random"),
             Variant("greedy", policy="greedy"),
-            Variant("most-occluding", policy="most-occluding"),
-            Variant("mctx", policy="mctx"),
+            Variant("most-occluding", policy=f"{POLICIES}.occlusion:most_occluding"),
+            Variant("mctx", policy=f"{POLICIES}.tree_search:mctx"),
             Variant("preset paper", {"preset": "paper"}),
             Variant("no trials", {"rehearsal": "none"}),
             Variant("10 sequences", {"sequences": 10}),

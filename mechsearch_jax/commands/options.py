@@ -229,8 +229,7 @@ class OnePolicy:
 
     Attributes:
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
-      policy: instead of a method, the name of a policy (also random, greedy, most-occluding, mctx), or the import path
-        of another.
+      policy: instead of a method, the name of a policy (also random, greedy), or the import path of another.
     """
 
     method: Annotated[

@@ -28,7 +28,6 @@ from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
-from mechsearch_jax.planner.occlusion import draw_by_occlusion, plan_by_occlusion
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
 from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
@@ -318,46 +317,11 @@ def greedy(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
     return search_and_grasp(plain, **slots)
 
 
-def most_occluding(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
-    """A baseline: moves the object that hides the most possible poses, by any action; see `occlusion`.
-
-    Once the target is found: the object that the most of its grasps hit.
-
-    If no action of the object is possible, the next one in that order is moved. It does not plan ahead and does not
-    move a found target: of `config`, the horizon, `move_target`, the guided fraction, the crowding weight and all
-    penalties are ignored.
-    """
-    plain = dataclasses.replace(
-        _planner_config(config),
-        horizon=1,
-        move_target=False,
-        guided_fraction=0.0,
-        crowding_weight=0.0,
-        unseen_contact_penalty=0.0,
-    )
-    return search_and_grasp(plain, propose=draw_by_occlusion, **slots).replace(plan=plan_by_occlusion)
-
-
-def mctx(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
-    """A baseline: Monte-Carlo tree search with the library `mctx` on the cost of `search_for_grasp`; see `tree_search`.
-
-    Raises:
-      InputError: `mctx` is not installed.
-    """
-    # An optional dependency that takes time to import.
-    from mechsearch_jax.planner.tree_search import import_mctx, tree_plan
-
-    import_mctx()
-    return search_for_grasp(config, **slots).replace(plan=tree_plan)
-
-
 POLICIES: Mapping[str, PolicyFactory] = {
     "search-for-grasp": search_for_grasp,
     "search-and-grasp": search_and_grasp,
     "random": random_action,
     "greedy": greedy,
-    "most-occluding": most_occluding,
-    "mctx": mctx,
 }
 
 
