@@ -148,7 +148,7 @@ def test_a_file_names_a_configuration(folder, jobs_of):
     (folder / "mine.toml").write_text('[planner]\npreset = "paper"\ngamma = 0.6\n')
     (folder / "sweep.toml").write_text('scenarios = "one.json"\nconfig = "mine.toml"\nhorizon = [1, 2]\n')
     jobs = jobs_of("sweep", "--file", "sweep.toml")
-    assert [job.method.config for job in jobs] == [PRESETS["paper"](gamma=0.6, draws=draws) for draws in (1, 2)]
+    assert [job.method.config for job in jobs] == [PRESETS["paper"](gamma=0.6, horizon=horizon) for horizon in (1, 2)]
 
 
 @pytest.mark.parametrize(
@@ -186,10 +186,8 @@ def test_every_option_may_be_swept(option):
 
 def test_what_a_run_would_take_is_printed_and_nothing_is_run(folder, capsys):
     common = ("one.json", "two.json", "--out", "rows", "--workers", "2", "--dry-run")
-    gammas = [str(0.5 + 0.01 * i) for i in range(24)]
-    cli.parse(
-        ["sweep", *common, "--gamma", *gammas, "--guided-fraction", "0", "0.7", "--unseen-contact-penalty", "0", "1"]
-    )()
+    gammas = [str(0.5 + 0.005 * i) for i in range(96)]
+    cli.parse(["sweep", *common, "--gamma", *gammas])()
     output = capsys.readouterr().out
     assert output.startswith(
         "96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner"

@@ -501,7 +501,8 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
     belief = decision[1]
     possible = possible_space(problem, belief, root.exists)
     probability = jax.jit(jax.vmap(lambda s: contact_probability(problem.space, root.scene, possible, s)))
-    share = np.asarray(probability(jax.vmap(somewhere)(keys)))
+    drawn = jax.vmap(lambda key: somewhere(jax.random.fold_in(key, 0)))(keys)
+    share = np.asarray(probability(drawn))
     assert len(np.unique(share)) > 2
     penalties = penalties_of(rollout_of(problem, belief, policy), root, keys)
     np.testing.assert_allclose(penalties, 0.5 * share, rtol=1e-6)
@@ -550,7 +551,7 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"gamma": 1.5}, "gamma 1.5"),
         ({"horizon": 0}, "horizon 0 must be at least 1"),
         ({"sequences": 0}, "sequences 0"),
-        ({"guided_fraction": 0.5}, "guided_fraction is no option any more: it is fixed at 0.7 .in preset paper at 0.0"),
+        ({"guided_fraction": 0.5}, "guided_fraction is no option any more: it is fixed at 0.7 .in preset paper at 0."),
         ({"imitates": "me"}, "imitates is no option any more: it is fixed at nothing; leave it out"),
         (
             {"grasp_tilts": (0.1,)},

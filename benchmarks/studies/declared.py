@@ -14,8 +14,7 @@ from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 from mechsearch_jax.envs.world.mismatch import Mismatch
 
 ABLATION_SCENES = "development"
-# A set for each later question, since a set that was looked at is no longer unseen.
-CONFIRMATION_SCENES, DEFAULT_SCENES = "report-c", "report-d"
+DEFAULT_SCENES = "report-d"
 STANDARD = Variant("standard")
 # Where policies to compare with are that no command has a name for.
 POLICIES = "mechsearch_jax.benchmarks.policies"
@@ -55,7 +54,6 @@ _ABLATIONS = (
             Variant("sequences 3000", {"sequences": 3000}, value=3000.0, scenes=25),
         ),
         axis="sequences",
-        logarithmic=True,
     ),
     Study(
         "actions",
@@ -160,7 +158,6 @@ _ONE_AHEAD_STUDIES = (
             Variant("300, true shapes", {"sequences": 300}),
             Variant("30 of three actions, true shapes", _THREE_AHEAD),
         ),
-        chooses=True,
     ),
 )
 
@@ -185,7 +182,6 @@ _BASELINES = (
             Variant("collision-free", {"retrieval_contact": False}),
             Variant("informed, collision-free", {"recognition": "informed", "retrieval_contact": False}),
         ),
-        by_time=True,
     ),
 )
 

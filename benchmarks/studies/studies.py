@@ -70,9 +70,6 @@ class Study:
       scenes: name of a scene set.
       variants: the first is what the others are compared with.
       axis: what `Variant.value` is, in words and with its unit; None where variants are not on an axis.
-      logarithmic: whether the axis is.
-      by_time: whether its picture shows success against planning time.
-      chooses: whether a default is chosen by it, so that its scenes are no longer ones that nothing was chosen on.
     """
 
     name: str
@@ -80,9 +77,6 @@ class Study:
     scenes: str
     variants: tuple[Variant, ...]
     axis: str | None = None
-    logarithmic: bool = False
-    by_time: bool = False
-    chooses: bool = False
 
     @property
     def baseline(self) -> Variant:

@@ -26,7 +26,7 @@ from mechsearch_jax.commands.cell.calibrate import calibrate
 from mechsearch_jax.commands.cell.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
-from mechsearch_jax.commands.options import EpisodeOptions, with_planner_options
+from mechsearch_jax.commands.options import EpisodeOptions, in_boxes, out_of_boxes, with_planner_options
 from mechsearch_jax.commands.plan import plan
 from mechsearch_jax.commands.recordings import video, view
 from mechsearch_jax.commands.report import report
@@ -94,8 +94,12 @@ def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]
     parameters = dict(signature.parameters)
     if "options" in hints:
         options = _OPTIONS[hints["options"]]()
-        hints["options"] = Annotated[options, tyro.conf.arg(name="")]
-        parameters["options"] = parameters["options"].replace(default=options())
+        boxes = in_boxes(options)
+        parsed = lambda *args, **kwargs: functools.partial(  # noqa: E731
+            command, *args, **kwargs | {"options": out_of_boxes(options, kwargs["options"])}
+        )
+        hints["options"] = Annotated[boxes, tyro.conf.arg(name="")]
+        parameters["options"] = parameters["options"].replace(default=boxes())
     for name, parameter in parameters.items():
         # The help of such an option describes its default.
         given_by_place = parameter.kind is inspect.Parameter.POSITIONAL_ONLY

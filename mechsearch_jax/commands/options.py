@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -154,6 +154,54 @@ def with_planner_options() -> type[EpisodeOptions]:
         hint = f"(default: {getattr(Mismatch(), option.path[0])})"
         fields.append((option.name, _annotation(option, hint), None))
     return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
+
+
+# Boxes of the help, by the names of their first words, with what they are about. Planner options are all the others.
+BOXES = {
+    "search": "Where settings come from, and how a search is run.",
+    "recognition": "What the planner sees the objects through.",
+    "planner": "How the next action is chosen.",
+    "world": "How the simulated world differs from what the planner assumes.",
+}
+_SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "rehearsal", "max_steps")
+_RECOGNITION = (
+    *("recognition", "depth_noise", "missing_depth", "holes"),
+    *("color_noise", "exposure", "white_balance", "hue_gap"),
+)
+
+
+def _box(name: str) -> str:
+    """The box of an option."""
+    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
+
+    if name in _RECOGNITION:
+        return "recognition"
+    if name in _SEARCH:
+        return "search"
+    return "world" if name in {option.name for option in MISMATCH_OPTIONS} else "planner"
+
+
+@functools.cache
+def in_boxes(options: type) -> type:
+    """A type with the fields of a type of options in a part for each of `BOXES`; for the parser alone."""
+    described = next(kind.__doc__ or "" for kind in options.__mro__ if "Attributes:" in (kind.__doc__ or ""))
+    hints = get_type_hints(options, include_extras=True)
+    parts: list[tuple[str, Any, Any]] = []
+    for box, about in BOXES.items():
+        fields = [
+            (field.name, hints[field.name], field.default)
+            for field in dataclasses.fields(options)
+            if _box(field.name) == box
+        ]
+        part = dataclasses.make_dataclass(box.capitalize(), fields, frozen=True, kw_only=True)
+        part.__doc__ = f"{about}\n\n    Attributes:{described.partition('Attributes:')[2]}"
+        parts.append((box, Annotated[part, tyro.conf.OmitArgPrefixes], dataclasses.field(default_factory=part)))
+    return dataclasses.make_dataclass("Boxes", parts, frozen=True, kw_only=True)
+
+
+def out_of_boxes(options: type, boxes: Any) -> Any:
+    """The options of an instance of `in_boxes(options)`."""
+    return options(**{name: value for box in BOXES for name, value in vars(getattr(boxes, box)).items()})
 
 
 def _annotation(option: Option, hint: str) -> Any:

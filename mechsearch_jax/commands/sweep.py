@@ -209,8 +209,8 @@ def sweep(
 ) -> None:
     """Run many episodes with all combinations of several values of any option; otherwise as evaluate.
 
-    The rows are those of evaluate, in the same kind of folder. Settings that are continuous (gamma, charges, guidance)
-    share one compilation, and in batches one batch.
+    The rows are those of evaluate, in the same kind of folder. Values of gamma share one compilation, and in batches one
+    batch.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
