@@ -568,6 +568,19 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
 
 
 @pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
+        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
+        ({"crowding_weight": float("nan")}, "crowding_weight nan"),
+    ],
+)
+def test_what_is_no_option_is_checked_too(changes, message):
+    with pytest.raises(InputError, match=message):
+        PlannerConfig(**changes)
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         (

@@ -209,7 +209,7 @@ def sweep(
 ) -> None:
     """Run many episodes with all combinations of several values of any option; otherwise as evaluate.
 
-    The rows are those of evaluate, in the same kind of folder. Values of gamma share one compilation, and in batches one
+    The rows are those of evaluate, in the same kind of folder. Values of gamma share one compilation, in batches one
     batch.
 
     Args:
