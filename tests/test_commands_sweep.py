@@ -154,6 +154,7 @@ def test_a_file_names_a_configuration(folder, jobs_of):
 @pytest.mark.parametrize(
     ("text", "message"),
     {
+        "draws = [1, 2]": r"sweep.toml:1: draws: draws is no option any more: it is fixed at 1 ",
         "gama = 0.5": r"sweep.toml:1: gama is unknown; did you mean gamma\?",
         "seed = 0\ngamma = [0.5, 'x']": r"sweep.toml:2: gamma\[1\] must be a number",
         "[planner]\ngamma = 0.5": r"sweep.toml:1: \[planner\] is a table",
