@@ -12,7 +12,7 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.actions.types import Prediction, Sample
-from mechsearch_jax.benchmarks.policies.tree_search import tree_plan, width
+from mechsearch_jax.benchmarks.policies.tree_search import mctx, tree_plan, width
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.runtime.errors import InputError
