@@ -144,7 +144,7 @@ def test_a_node_has_fewer_actions_than_are_predicted(sequences, horizon, expecte
 
 
 def test_the_policy_is_known_by_its_name_and_keeps_the_slots():
-    policy = mctx(CONFIG)
+    policy = planner.policy_factory("mechsearch_jax.benchmarks.policies.tree_search:mctx")(CONFIG)
     assert policy.plan is tree_plan
     assert policy.objective == planner.search_for_grasp().objective
 
