@@ -384,8 +384,9 @@ def test_the_papers_criterion_lets_visible_targets_pass(problem):
 
 
 def test_bad_settings_are_refused_with_what_would_do():
-    with pytest.raises(InputError, match="downscale"):
-        ExistenceConfig(downscale=0)
+    for downscale in (0, 3):
+        with pytest.raises(InputError, match=f"downscale {downscale} must be"):
+            ExistenceConfig(downscale=downscale)
 
 
 def test_the_candidate_poses_cover_the_board(problem):

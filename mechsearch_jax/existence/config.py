@@ -41,6 +41,10 @@ class ExistenceConfig:
     def __post_init__(self):
         if self.downscale < 1:
             raise InputError(f"ExistenceConfig: downscale {self.downscale} must be at least 1")
+        if self.looks_closer and self.downscale <= CLOSER_LOOK:
+            raise InputError(
+                f"ExistenceConfig: downscale {self.downscale} must be above that of a closer look, {CLOSER_LOOK}"
+            )
 
     @property
     def looks_closer(self) -> bool:
