@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.actions.types import Action
     from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
     from mechsearch_jax.config.config import Config
-    from mechsearch_jax.config.presets import best, paper, standard
+    from mechsearch_jax.config.presets import paper, standard
     from mechsearch_jax.geometry.superquadric import Superquadrics
     from mechsearch_jax.images.examples import example_images
     from mechsearch_jax.observation import Observation
@@ -72,7 +72,6 @@ _ROOMS = {
     "Superquadrics": "geometry.superquadric",
     "Target": "workspace.target",
     "Workcell": "problem.workcell",
-    "best": "config.presets",
     "build_problem": "problem.problem",
     "cached_problem": "problem.cache",
     "example_images": "images.examples",
@@ -115,7 +114,6 @@ __all__ = [
     "Superquadrics",
     "Target",
     "Workcell",
-    "best",
     "build_problem",
     "cached_problem",
     "example_images",

@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.options import option
 
 # From farther to the side the hand would come from behind [rad]; a little more, for a rounded right angle.
 LARGEST_YAW = math.pi / 2 + 1e-3
@@ -33,15 +32,9 @@ class GraspConfig:
         surface, from any side and angle (`antipodal_grasps`); 0 for the best level ones at `tilts` and `wrists` alone.
     """
 
-    max_yaw: float = option(
-        math.radians(45),
-        "largest angle between the approach to the target and straight into the shelf, at most 1.571 [rad]",
-    )
+    max_yaw: float = math.radians(45)
     yaw_step: float = math.radians(15)
-    tilts: tuple[float, ...] = option(
-        (math.radians(20), math.radians(25), math.radians(30)),
-        "angles by which the gripper points downwards as it grasps the target [rad]; the paper's is 0.35",
-    )
+    tilts: tuple[float, ...] = (math.radians(20), math.radians(25), math.radians(30))
     wrists: tuple[float, ...] = (math.radians(-60), 0.0, math.radians(60))
     height: float = 0.03
     points: int = 2048

@@ -55,7 +55,6 @@ GROUPS = {
         "test_envs_episode",
         "test_envs_batch_episode",
         "test_existence",
-        "test_envs_protocols",
         "test_envs_verdicts",
         "test_preparing",
         "test_readme",

@@ -77,13 +77,6 @@ def test_episodes_with_another_budget_are_counted_up_to_the_smaller_one():
     assert budget_of([early, late]) == 10
 
 
-def test_where_nothing_is_taken_out_there_is_no_time_of_it():
-    row = row_of("c2-2-000", Method(protocol="published-code", engine="NativeSimulator"))
-    assert restricted_steps(row, "retrieved", 10) is None
-    (mean, _) = restricted_means([row], ["seed"])
-    assert (mean.retrieved, mean.retrieved_interval, mean.found) == (None, None, 1.0)
-
-
 def test_the_mean_is_the_area_above_the_curve_as_scipy_draws_it():
     """Failures and the spent budget are censored at the horizon, not where they happened."""
     rows = [row for row in report_bench.drawn_rows(96 * 4 * 40) if row.gamma == 0.9 and row.horizon == 3]

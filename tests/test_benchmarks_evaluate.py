@@ -94,12 +94,12 @@ def test_rows_of_other_options_stay(tmp_path, files):
 @pytest.mark.parametrize(
     "other",
     [
-        {"criterion": "depth-mse"},
+        {"retrieval_contact": False},
         {"max_steps": 5},
-        {"unseen_contact_penalty": 0.5},
+        {"sequences": 50},
         {"push_distances": (0.1,)},
         {"push_model": "physics"},
-        {"crowding_weight": 0.5},
+        {"gamma": 0.5},
     ],
     ids=lambda other: next(iter(other)),
 )

@@ -41,11 +41,11 @@ LOST = dataclasses.replace(WON, found_step=None, graspable_step=None, retrieved=
 
 
 def rows_of(variants, episodes=3, lost=lambda variant, episode: False):
-    """Rows of variants that differ in gamma, guided fraction and criterion."""
+    """Rows of variants that differ in gamma, guidance and choice."""
     combinations = itertools.product(np.linspace(0.5, 1.0, 6).tolist(), (0.0, 0.4, 0.7, 0.9), "abcd")
     rows = []
-    for i, (gamma, guided, criterion) in enumerate(itertools.islice(combinations, variants)):
-        options = {"gamma": gamma, "guided_fraction": guided, "criterion": criterion, "push_distances": [0.1, 0.2]}
+    for i, (gamma, guided, choice) in enumerate(itertools.islice(combinations, variants)):
+        options = {"gamma": gamma, "guidance": guided, "choice": choice, "push_distances": [0.1, 0.2]}
         for j in range(episodes):
             row = LOST if lost(i, j) else WON
             more = {"gamma": gamma, "configuration": configuration(options)}
@@ -74,9 +74,9 @@ def test_labels_are_short_and_say_what_differs():
 def test_a_variant_goes_by_its_label_or_by_what_tells_it_from_others():
     key = Key.of(rows_of(8))
     label = next(label for label, short in key.short.items() if short == "V4")
-    assert {key.named(text) for text in ("V4", label, "guided-fraction 0.4,criterion=b".replace("-", "_"))} == {label}
-    with pytest.raises(InputError, match=r'variant "criterion=b" is one of several: V3'):
-        key.named("criterion=b")
+    assert {key.named(text) for text in ("V4", label, "guidance 0.4,choice=b".replace("-", "_"))} == {label}
+    with pytest.raises(InputError, match=r'variant "choice=b" is one of several: V3'):
+        key.named("choice=b")
     with pytest.raises(InputError, match=r'variant "V9" is unknown: V1 .*; \.\.\.$'):
         key.named("V9")
 
@@ -89,10 +89,10 @@ def test_numbers_in_texts_sort_as_numbers():
 
 def test_rates_are_grouped_by_any_columns():
     rows = rows_of(8, lost=lambda variant, episode: variant < 4 and episode == 0)
-    assert set(column(rows, "guided-fraction")) == {0.0, 0.4}
+    assert set(column(rows, "guidance")) == {0.0, 0.4}
     assert set(column(rows, "push_distances")) == {"0.1/0.2"}
     assert column(rows, "variant") == label_variants(rows)
-    summary = summarise(rows, ["guided_fraction", "scenario"])
+    summary = summarise(rows, ["guidance", "scenario"])
     assert [(*rates.group.values(), rates.episodes, rates.found) for rates in summary] == [
         *((0.0, "s0", 4, 0.0), (0.0, "s1", 4, 1.0), (0.0, "s2", 4, 1.0), (0.0, None, 12, 8 / 12)),
         *((0.4, "s0", 4, 1.0), (0.4, "s1", 4, 1.0), (0.4, "s2", 4, 1.0), (0.4, None, 12, 1.0)),
@@ -176,9 +176,7 @@ def test_a_report_says_which_scenes_were_chosen_on(tmp_path):
 @pytest.mark.parametrize("variants", [2, 96])
 def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variants):
     rows = rows_of(variants, lost=lambda variant, episode: (variant + episode) % 3 == 0)
-    report = Report.of(
-        rows, ReportOptions(curve=["gamma", "guided_fraction"], baseline="V03" if variants > 2 else "criterion a")
-    )
+    report = Report.of(rows, ReportOptions(curve=["gamma", "guidance"], baseline="V03" if variants > 2 else "choice a"))
     write_report(report, tmp_path)
     for name in ("success.png", "rates.png", "curve.png"):
         height, width = image.imread(tmp_path / name).shape[:2]
@@ -270,15 +268,15 @@ def test_a_page_is_written_three_ways():
 
 def test_a_curve_is_over_one_column_with_lines_for_another():
     rows = rows_of(96)
-    report = Report.of(rows, ReportOptions(curve=["gamma", "criterion"]))
+    report = Report.of(rows, ReportOptions(curve=["gamma", "choice"]))
     assert len(report.curve) == 24
     assert {rates.episodes for rates in report.curve} == {12}
     axes = curve_figure(report.curve, report.curve_columns, {}).axes
     assert [len(each.get_lines()) for each in axes] == [4, 4, 4]
     assert axes[0].get_lines()[0].get_xdata() == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
-    assert "Rates over gamma and criterion" in as_markdown(blocks(report))
+    assert "Rates over gamma and choice" in as_markdown(blocks(report))
     with pytest.raises(InputError, match="give one column, or a second one"):
-        Report.of(rows, ReportOptions(curve=["gamma", "criterion", "seed"]))
+        Report.of(rows, ReportOptions(curve=["gamma", "choice", "seed"]))
     with pytest.raises(InputError, match="method has 96 values"):
         Report.of(rows, ReportOptions(curve=["gamma", "method"]))
 
@@ -287,10 +285,10 @@ def test_the_command_reports_what_its_options_name(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     write_rows(rows_of(8, lost=lambda variant, episode: variant == 0), tmp_path / "table.parquet")
-    arguments = ["report", "table.parquet", "--rows", "guided-fraction,objects", "--curve", "guided_fraction"]
+    arguments = ["report", "table.parquet", "--rows", "guidance,objects", "--curve", "guidance"]
     cli.parse([*arguments, "--baseline", "V1", "--paired", "scenario,seed", "--out", "out"])()
     said = capsys.readouterr().out
-    assert "guided fraction objs runs found graspable paper's retrieved actions plan  act" in said
+    assert "guidance objs runs found graspable paper's retrieved actions plan  act" in said
     assert re.search(r"V2\s+3 \+100\.0 ± 0\.0", said)
     assert not re.search("…", said)
     assert max(map(len, said.splitlines())) <= 100
@@ -375,7 +373,7 @@ def check_evidence(step, row, scenario):
     """What a recorded step foresees and what grasps of the target hit is what planner and judgement say."""
     method, weights = Method.of_options(options_of(row)), PlannerConfig().weights
     world = jax.tree.map(jnp.asarray, step.world)
-    problem = method.workcell.problem(target_of(scenario, method.workcell.target), method.problem_config)
+    problem = method.workcell.problem(target_of(scenario, method.workcell.target), method.config.problem)
     judged = judge(problem, InFullView(), weights, world, jnp.array(True))
     hits = np.asarray(judged.hits)[np.asarray(judged.feasible)]
     assert hits.any()

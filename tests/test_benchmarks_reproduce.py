@@ -43,7 +43,7 @@ from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
 ROW = Row("a", 2, "cylinder", METHODS[1], "oracle", 0.9, 3, 30, "push+pick-and-place", 0, 1, 2, True, 3, None, 1.5, 0.6)
-FOR = Setting(METHODS[1], "masks", BOTH, "paper", "strict")
+FOR = Setting(METHODS[1], "masks", BOTH, "paper")
 AND = FOR._replace(method=METHODS[0])
 
 
@@ -135,13 +135,13 @@ def test_settings_are_compared_in_one_thing_at_a_time():
         assert sum(a != b for a, b in zip(one.setting, other, strict=True)) == 1
 
 
-def test_the_page_has_a_table_for_each_preset_and_protocol():
+def test_the_page_has_a_table_for_each_preset():
     rows = [row("a", 1, 2), row("b", None, None)]
-    shown = results({FOR: rows, AND: rows, FOR._replace(protocol="published-code"): rows})
+    shown = results({FOR: rows, AND: rows, FOR._replace(preset="standard"): rows})
     page = re.sub(" +", " ", markdown(shown, "mechsearch reproduce table1"))
     assert re.findall(r"^## (.*)$", page, re.MULTILINE) == [
-        "Preset paper, protocol strict",
-        "Preset paper, protocol published-code",
+        "Preset paper",
+        "Preset standard",
         "Paired differences",
     ]
     low, high = wilson(1, 2)
@@ -191,7 +191,7 @@ def test_the_command_runs_every_cell_and_draws_what_came_of_it(run, tmp_path):
     assert shown == {(name, actions) for name in METHODS for actions in TABLES["table4"].actions}
     assert len(jobs) == len({job.key for job in jobs}) == 2 * 2 * 6
     assert {job.method.recognition for job in jobs} == {"masks"}
-    assert "table4, preset paper, protocol strict" in printed.out
+    assert "table4, preset paper" in printed.out
     value = json.loads((tmp_path / "rows" / "table4.json").read_text())
     assert value["table"] == "table4"
     cell = next(cell for cell in value["cells"] if cell["setting"]["actions"] == list(PUSH))
@@ -200,14 +200,10 @@ def test_the_command_runs_every_cell_and_draws_what_came_of_it(run, tmp_path):
     assert re.search(r"\| masks +\| search-for-grasp +\| push +\|", (tmp_path / "rows" / "table4.md").read_text())
 
 
-def test_by_default_all_that_the_paper_compares_is_run_strictly(run):
+def test_by_default_all_that_the_paper_compares_is_run(run):
     jobs, _ = run("table3", "--scenes", "1")
     assert len(jobs) == 2 * 3 * 2
-    assert {job.method.protocol for job in jobs} == {"strict"}
     assert len({job.method.config for job in jobs}) == 2
-    both, _ = run("table3", "--scenes", "1", "--protocol", "strict", "published-code")
-    assert len(both) == 24
-    assert {job.key for job in jobs} < {job.key for job in both}
 
 
 def test_parts_of_several_machines_make_one_table(run, tmp_path):
@@ -223,7 +219,7 @@ def test_a_dry_run_says_what_it_would_be(run, tmp_path):
     jobs, printed = run("table1", "--scenes", "2", "--objects", "2", "8", "--preset", "standard", "--dry-run")
     assert not jobs
     assert not (tmp_path / "rows").exists()
-    assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, strict, any" in printed.out
+    assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, any" in printed.out
     assert "6 variants, 24 episodes, 0 of them there already, 24 left" in printed.out
     assert re.search(r"^  standard, full, with trials, native simulator: 8 x [\d.]+ s, 2 x ", printed.out, re.M)
 
@@ -294,7 +290,7 @@ def test_collision_free_grasps_are_a_column_of_their_own(monkeypatch):
     shown = results(rows, "table3")
     assert [one.factor for one in shown.differences()] == ["method", "method", "grasps", "grasps"]
     page = markdown(shown, "mechsearch reproduce table3")
-    assert "## Preset standard, protocol strict, collision-free grasps" in page
+    assert "## Preset standard, collision-free grasps" in page
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from mechsearch_jax.planner import PRESETS
 ROOT = Path(__file__).parents[1]
 
 
-def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", protocol="strict", **fields):
+def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", **fields):
     """Rows of all methods and actions on scenes of each block, by their numbers or so many of the first.
 
     `reach` says after how many actions the target was found and graspable.
@@ -39,7 +39,7 @@ def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", proto
     for policy in METHODS:
         for recognition in recognitions:
             for actions in paper_table.actions:
-                method = Method(policy, PRESETS[preset](actions=actions), recognition, protocol=protocol)
+                method = Method(policy, PRESETS[preset](actions=actions), recognition)
                 for objects, block in paper_table.blocks.items():
                     for number in range(scenes) if isinstance(scenes, int) else scenes:
                         found_step, graspable_step = reach(policy, recognition, actions, objects, number)
@@ -174,17 +174,7 @@ def test_what_may_touch_something_counts_as_taken_out_and_is_apart():
     to_grasp = finding("needs fewer actions to grasp")
     (one,) = verdicts(to_grasp, {"table3": results})
     # With grasps that touch nothing alone, none was graspable: no actions to compare.
-    assert (one.part, one.goal, one.change.value) == ("preset standard, protocol strict", "retrieved", 0.0)
-
-
-def test_where_nothing_is_taken_out_a_grasp_is_that_the_target_is_graspable():
-    def reach(policy, *_):
-        return 1, 2 if policy == METHODS[1] else None
-
-    rows = rows_of("table1", 20, reach, preset="standard", protocol="published-code", retrieved=False)
-    tables = {"table1": results_of_runs(TABLES["table1"], [run_of("x", list(rows), command="reproduce table1")])}
-    (one,) = verdicts(finding("With 6 and 8 objects, search-for-grasp grasps"), tables)
-    assert (one.goal, one.verdict, one.change.value) == ("graspable", HOLDS, 1.0)
+    assert (one.part, one.goal, one.change.value) == ("preset standard", "retrieved", 0.0)
 
 
 def in_simulator(rows, name):
@@ -215,19 +205,19 @@ def test_a_finding_of_one_method_alone_says_so(tmp_path):
     half = [row for row in rows if (row.recognition, row.policy) != ("masks", METHODS[1])]
     for kept, text in ((rows, "`masks`: **holds**"), (half, f"`masks`, {METHODS[0]} alone: **holds**")):
         stored(tmp_path, "table1", kept)
-        assert f"    - preset paper, protocol strict, {text}, found +0.000" in reproduction_page.page(tmp_path)
+        assert f"    - preset paper, {text}, found +0.000" in reproduction_page.page(tmp_path)
 
 
 def test_tables_have_no_columns_that_say_nothing(tmp_path):
-    rows = rows_of("table1", 3, lambda *_: (1, 2), protocol="published-code")
+    rows = rows_of("table1", 3, lambda *_: (1, 2), objects_fallen=None)
     stored(tmp_path, "table1", rows)
     stored(tmp_path, "table4", rows_of("table4", 3, lambda *_: (1, 2)))
     page = reproduction_page.page(tmp_path)
     assert "Rows: [table4](../benchmarks/results/runs/table4.jsonl); NativeSimulator." in page
     before, _, after = page.partition("## Table 4")
     assert (
-        "| recognition | method | objects | episodes | found | paper | graspable | paper | with the paper's grasps |\n"
-        in before
+        "| recognition | method | objects | episodes | found | paper | graspable | paper | with the paper's grasps | "
+        "retrieved |\n" in before
     )
     assert "| recognition | method | actions | objects | episodes |" in after
     stored(tmp_path, "table3", rows_of("table3", 3, lambda *_: (1, 2), preset="standard"))
@@ -245,12 +235,10 @@ def test_another_folder_is_no_page_without_runs(tmp_path, capsys):
 
 def test_variants_that_are_no_cells_are_left_out():
     line = {"preset": "paper", "settings": {"policy": METHODS[0], "recognition": "masks", "actions": list(PUSH)}}
-    assert setting_of(line) == Setting(METHODS[0], "masks", PUSH, "paper", "strict")
+    assert setting_of(line) == Setting(METHODS[0], "masks", PUSH, "paper")
     assert setting_of({**line, "settings": {"gamma": 0.5}}) is None
     assert setting_of({**line, "settings": {"policy": "random"}}) is None
-    assert setting_of({"preset": "standard", "settings": {}}) == Setting(
-        METHODS[1], "oracle", BOTH, "standard", "strict"
-    )
+    assert setting_of({"preset": "standard", "settings": {}}) == Setting(METHODS[1], "oracle", BOTH, "standard")
 
 
 def test_the_newest_run_of_a_cell_counts():
@@ -281,7 +269,7 @@ def test_a_page_of_all_tables(tmp_path):
     page = reproduction_page.page(tmp_path)
     assert "There are no rows yet" not in re.sub(".*`mechsearch reproduce table1 --recognition oracle full.*", "", page)
     assert [f"Table {number}" in page for number in "1345"] == [True] * 4
-    assert "### Table 1, preset standard, protocol strict" in page
+    assert "### Table 1, preset standard" in page
     assert "### Table 1 on scenes that nothing was chosen on" in page
     assert "not in the paper" in page
     assert (
@@ -300,4 +288,4 @@ def test_hard_scenes_are_counted():
 
     run = run_of("x", list(rows_of("table3", 4, reach)), command="reproduce table3")
     table = reproduction_page.difficulty_table({"table3": results_of_runs(TABLES["table3"], [run])})
-    assert table.splitlines()[-1] == "| Table 3 | preset paper, protocol strict | 2 | 4 | 2 | 2 | 0 | 1 | 0 | 0 | 1 |"
+    assert table.splitlines()[-1] == "| Table 3 | preset paper | 2 | 4 | 2 | 2 | 0 | 1 | 0 | 0 | 1 |"

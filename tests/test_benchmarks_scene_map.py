@@ -48,13 +48,12 @@ def test_variants_are_called_by_their_presets_and_what_deviates():
     changed = dataclasses.replace(
         USUAL,
         name="random",
-        config=PRESETS["best"](gamma=0.5),
+        config=PRESETS["paper"](gamma=0.5),
         mismatch=Mismatch(friction=0.5),
-        protocol="published-code",
     )
     name = preset_name(changed.options(), str)
-    assert name.preset == "best"
-    assert set(name.deviations.split(", ")) == {"gamma 0.5", "random", "protocol published-code", "friction 0.5"}
+    assert name.preset == "paper"
+    assert set(name.deviations.split(", ")) == {"gamma 0.5", "random", "friction 0.5"}
 
 
 def test_what_is_no_preset_long_or_not_unique_is_numbered():

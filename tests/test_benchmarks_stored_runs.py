@@ -64,10 +64,8 @@ def test_an_error_reaches_nothing():
 
 
 def test_what_a_row_does_not_say_is_no_share():
-    older, published = row_of("c2-4-100", objects_fallen=None), row_of("c2-4-100", Method(protocol="published-code"))
-    for row, unsaid in ((older, {"drop_free"}), (published, {"retrieved", "drop_free"})):
-        (line,) = run_of("x", [row]).lines
-        assert {name for name in OUTCOMES if line[name] is None} == unsaid
+    (line,) = run_of("x", [row_of("c2-4-100", objects_fallen=None)]).lines
+    assert {name for name in OUTCOMES if line[name] is None} == {"drop_free"}
 
 
 def test_parts_of_other_code_and_those_that_disagree_are_refused(tmp_path):
@@ -112,7 +110,7 @@ def test_every_preset_is_its_own_settings():
         assert settings_of(options) == (name, {})
         assert settings_of({**options, "gamma": 0.5}) == (name, {"gamma": 0.5})
     later = Method().options()
-    del later["crowding_weight"]
+    del later["move_target"]
     assert settings_of(later) == ("standard", {})
 
 
@@ -124,11 +122,10 @@ def test_scenes_are_of_sets():
 def test_twenty_thousand_rows_are_small(tmp_path):
     draw = random.Random(0)
     methods = [
-        Method(policy, PRESETS[preset](), recognition, protocol=protocol)
+        Method(policy, PRESETS[preset](), recognition)
         for policy in ("search-for-grasp", "search-and-grasp")
         for preset in ("standard", "paper")
         for recognition in ("oracle", "masks", "full")
-        for protocol in ("strict", "published-code")
     ]
     usual = [row_of("c2-4-001", method) for method in methods]
     rows = [
@@ -149,7 +146,7 @@ def test_twenty_thousand_rows_are_small(tmp_path):
         )
         for row in usual
         for objects in (2, 4, 6, 8)
-        for number in range(180)
+        for number in range(360)
     ]
     files = write_run(run_of("large", rows), tmp_path)
     assert len(rows) == 17_280

@@ -327,13 +327,13 @@ def test_what_is_given_goes_before_the_preset(preset):
 
 def test_actions_go_by_the_name_of_a_set():
     standard, paper = PRESETS["standard"]().options(), PRESETS["paper"]().options()
-    names = ("actions", "push_directions", "push_distances", "object_grasp_tilts", "object_grasp_max_yaw")
+    names = ("actions", "push_directions", "push_distances")
     of_paper = {name: paper[name] for name in names}
     assert of_paper != {name: standard[name] for name in names}
     assert options_of("--actions", "paper").settings().config == PRESETS["standard"](**of_paper)
     assert options_of("--preset", "paper", "--actions", "paper").settings().config == PRESETS["paper"]()
-    given = options_of("--actions", "paper", "--push-distances", "0.2", "--draws", "3")
-    assert given.settings().config == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "draws": 3})
+    given = options_of("--actions", "paper", "--push-distances", "0.2", "--horizon", "3")
+    assert given.settings().config == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "horizon": 3})
     with pytest.raises(InputError, match="actions: paper is a whole set of actions; give it alone"):
         options_of("--actions", "push", "paper").settings()
 
@@ -362,15 +362,23 @@ def test_a_policy_goes_by_a_methods_name_or_its_own():
     assert policies("--policy", "random", "my_lab.policies:Mine") == ("random", "my_lab.policies:Mine")
 
 
+@pytest.mark.parametrize("given", [("--draws", "3"), ("--first-draws=3",), ("--grasp-tilts", "0.1", "0.2")])
+def test_what_is_no_option_any_more_is_refused_with_what_it_is_fixed_at(given):
+    name = given[0].partition("=")[0]
+    with pytest.raises(
+        InputError, match=rf"^{name} is no option any more: it is fixed at [\d. ]+ \(in preset paper at "
+    ):
+        cli.parse(["evaluate", "first-light", "--out", "out", *given])
+
+
 def test_help_names_options_with_their_defaults(capsys):
     with pytest.raises(SystemExit) as end:
         cli.parse(["bench", "plan", "--help"])
     assert not end.value.code
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--gamma FLOAT" in shown
-    assert "(default: 0.7, in preset paper and published-code 0.0)" in shown
-    assert "(default: 1, in preset paper and published-code 8, in preset best 4)" in shown
-    assert "(default: 100, in preset paper and published-code 30)" in shown
+    assert "(default: physics, in preset paper none)" in shown
+    assert "(default: 100, in preset paper 30)" in shown
     assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
 

@@ -66,10 +66,10 @@ def test_a_sweep_is_all_combinations(jobs_of):
     jobs = jobs_of(
         *("sweep", "one.json", "two.json", "--seed", "3", "4", "--gamma", "0.5", "1", "--recognition", "oracle"),
         *("masks", "--policy", "random", "search-for-grasp", "--push-distances", "0.05,0.1", "0.1"),
-        *("--move-again", "True", "False"),
+        *("--move-target", "True", "False"),
     )
     expected = {
-        (scene, Method(policy, standard(gamma=gamma, push_distances=pushes, move_again=again), seen), seed)
+        (scene, Method(policy, standard(gamma=gamma, push_distances=pushes, move_target=again), seen), seed)
         for scene, policy, gamma, pushes, again, seen, seed in itertools.product(
             *(("one", "two"), ("random", "search-for-grasp"), (0.5, 1.0), ((0.05, 0.1), (0.1,)), (True, False)),
             *(("oracle", "masks"), (3, 4)),
@@ -119,7 +119,7 @@ gamma = [0.5, 1]
 horizon = 2
 push_distances = [[0.05, 0.1], [0.1]]
 push_directions = [1.5, -1.5]
-move_again = [true, false]
+move_target = [true, false]
 preset = ["standard"]
 recognition = "masks"
 """
@@ -131,7 +131,7 @@ def test_a_file_says_it_all_and_what_is_given_goes_before_it(folder, jobs_of):
     assert len(jobs) == 16
     fixed = {"horizon": 2, "push_directions": (1.5, -1.5)}
     assert {job.method for job in jobs} == {
-        Method("random", standard(gamma=gamma, push_distances=pushes, move_again=again, **fixed), "masks")
+        Method("random", standard(gamma=gamma, push_distances=pushes, move_target=again, **fixed), "masks")
         for gamma, pushes, again in itertools.product((0.5, 1.0), ((0.05, 0.1), (0.1,)), (True, False))
     }
     jobs = jobs_of(
@@ -140,20 +140,21 @@ def test_a_file_says_it_all_and_what_is_given_goes_before_it(folder, jobs_of):
     )
     fixed |= {"gamma": 0.8, "push_distances": (0.2,)}
     assert set(settings_of(jobs)) == {
-        ("two", Method("search-and-grasp", standard(move_again=again, **fixed)), 5) for again in (True, False)
+        ("two", Method("search-and-grasp", standard(move_target=again, **fixed)), 5) for again in (True, False)
     }
 
 
 def test_a_file_names_a_configuration(folder, jobs_of):
     (folder / "mine.toml").write_text('[planner]\npreset = "paper"\ngamma = 0.6\n')
-    (folder / "sweep.toml").write_text('scenarios = "one.json"\nconfig = "mine.toml"\ndraws = [1, 2]\n')
+    (folder / "sweep.toml").write_text('scenarios = "one.json"\nconfig = "mine.toml"\nhorizon = [1, 2]\n')
     jobs = jobs_of("sweep", "--file", "sweep.toml")
-    assert [job.method.config for job in jobs] == [PRESETS["paper"](gamma=0.6, draws=draws) for draws in (1, 2)]
+    assert [job.method.config for job in jobs] == [PRESETS["paper"](gamma=0.6, horizon=horizon) for horizon in (1, 2)]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     {
+        "draws = [1, 2]": r"sweep.toml:1: draws: draws is no option any more: it is fixed at 1 ",
         "gama = 0.5": r"sweep.toml:1: gama is unknown; did you mean gamma\?",
         "seed = 0\ngamma = [0.5, 'x']": r"sweep.toml:2: gamma\[1\] must be a number",
         "[planner]\ngamma = 0.5": r"sweep.toml:1: \[planner\] is a table",
@@ -186,10 +187,8 @@ def test_every_option_may_be_swept(option):
 
 def test_what_a_run_would_take_is_printed_and_nothing_is_run(folder, capsys):
     common = ("one.json", "two.json", "--out", "rows", "--workers", "2", "--dry-run")
-    gammas = [str(0.5 + 0.01 * i) for i in range(24)]
-    cli.parse(
-        ["sweep", *common, "--gamma", *gammas, "--guided-fraction", "0", "0.7", "--unseen-contact-penalty", "0", "1"]
-    )()
+    gammas = [str(0.5 + 0.005 * i) for i in range(96)]
+    cli.parse(["sweep", *common, "--gamma", *gammas])()
     output = capsys.readouterr().out
     assert output.startswith(
         "96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner"
@@ -250,7 +249,7 @@ def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
     methods = [
         Method(engine=batch),
         Method(config=PRESETS["paper"](), recognition="masks", engine=batch),
-        Method(config=PRESETS["paper"](), recognition="masks", engine=native, protocol="published-code"),
+        Method(config=PRESETS["paper"](), recognition="masks", engine=native),
         Method(recognition="full", engine=batch),
     ]
     outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]

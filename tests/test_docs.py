@@ -136,7 +136,7 @@ def test_the_api_pages_hold_all_of_the_front_door():
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
     table = rows("docs/commands.md", "| option | what it sets | `standard` | `paper` |")
     stated = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
-    assert {option.name for option in OPTIONS} == set(stated) - {"preset", "recognition", "simulator", "protocol"}
+    assert {option.name for option in OPTIONS} == set(stated) - {"preset", "recognition", "simulator"}
     for name, cells in stated.items():
         for preset, cell in zip(("standard", "paper"), cells, strict=False):
             value = PRESETS[preset]().options().get(name)

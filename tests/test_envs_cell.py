@@ -1,9 +1,6 @@
 """One call makes a searcher from a configuration file, and it plans as `mechsearch search` does with that file."""
 
-import dataclasses
-import math
 import os
-from pathlib import Path
 
 import pytest
 
@@ -48,20 +45,6 @@ def test_a_file_says_workcell_and_planner(file):
     assert policy.config == expected.config
     assert (policy.tries, searcher._trials) == (expected.tries, rehearsal("physics")) == (True, rehearsal("physics"))
     assert (policy.predict, policy.objective, policy.plan) == (expected.predict, expected.objective, expected.plan)
-
-
-def test_the_second_cell_of_the_bench_differs_in_its_grasps_alone():
-    cells = Path(__file__).resolve().parents[1] / "benchmarks/parts/cells"
-    usual, more = (load_settings(cells / f"{name}.toml") for name in ("other-cell", "other-cell-more-grasps"))
-    assert dataclasses.replace(more, given={}) == dataclasses.replace(usual, given={})
-    assert not usual.given
-    assert set(more.given) == {"retrieval_tilts", "object_grasp_tilts", "object_grasp_max_yaw"}
-    # What can be grasped as usual can be grasped as well.
-    for name in ("retrieval_tilts", "object_grasp_tilts"):
-        least, most = (choose(more.config.options()[name]) for choose in (min, max))
-        assert least < min(usual.config.options()[name])
-        assert most == pytest.approx(max(usual.config.options()[name]), abs=1e-4)
-    assert more.config.problem.actions.grasps.max_yaw == pytest.approx(math.pi / 2, abs=1e-4)
 
 
 def test_what_is_given_goes_before_the_file(file):

@@ -57,7 +57,7 @@ def check(episode, engine):
 @pytest.mark.slow
 def test_what_succeeds_in_physics_is_made_until_the_target_is_out(problem):
     method, decisions = Method(), Decisions()
-    assert (target_of(SCENARIO), method.problem_config) == (problem.target, problem.config)
+    assert (target_of(SCENARIO), method.config.problem) == (problem.target, problem.config)
     # Compiled once, with what other tests plan.
     assert method.policy() == search_for_grasp(tries=True)
     trials = Recorded(method.trials())

@@ -41,7 +41,6 @@ from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.numbering import named_observation
-from mechsearch_jax.envs.episode.protocols import WithTruePose
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
 from mechsearch_jax.envs.episode.slots import sizes_and_truths
 from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
@@ -203,24 +202,6 @@ def test_a_detection_is_the_target_only_where_the_target_is_in_sight(problem):
         shown[name] = [bool(truth_of(hasty, snapshot, look).shown) for look in (seen, elsewhere, unseen)]
         assert truth_of(informed, snapshot, seen).shown
     assert shown == {"hidden": [False, False, False], "open": [True, False, False]}
-
-
-def test_the_published_protocol_gives_the_pose_of_a_detected_target_only(problem):
-    """Not of a hidden one, for which something else is taken."""
-
-    @dataclasses.dataclass(frozen=True)
-    class Mistaken:
-        detects_target: bool = True
-
-        def __call__(self, key, snapshot):
-            seen = informed(key, snapshot)
-            return seen.replace(target_pose=seen.target_pose + jnp.array([0.02, 0.0, 0.0]))
-
-    for scenario, given in ((HIDDEN, False), (OPEN, True)):
-        snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
-        pose = WithTruePose(Mistaken())(jax.random.key(0), snapshot).target_pose
-        expected = np.asarray(snapshot.target_pose) + (0.0 if given else 0.02) * np.array([1.0, 0.0, 0.0])
-        np.testing.assert_allclose(pose, expected, atol=1e-6)
 
 
 def test_objects_in_any_order_give_the_same_decisions_and_names_follow_the_bodies(problem):

@@ -187,7 +187,7 @@ def test_slots_learn_between_looks_and_forget(problem):
     simulator.execute(PUSH)
     keys = jax.random.split(jax.random.key(0), 1)
     slot.look(before, keys, [0])
-    slot.took({0: PUSH})
+    slot.action = PUSH
     slot.look(jax.tree.map(lambda a: a[None], simulator.world), keys, [0])
     assert slot._learned.probabilities[0].argmax() > 2
     slot.forget(np.array([True]))
@@ -231,7 +231,12 @@ def test_each_of_many_slots_learns_from_its_own_action_and_assumes_what_it_learn
     known = slots._state.belief
     world = stack(*(from_scenario(begin(objects)) for objects, _ in rows))
     slots.look(world, keys, [0, 1, 2])
-    slots.took({2: over.replace(object=jnp.int32(2)), 0: over.replace(object=jnp.int32(1))})
+    done = [
+        over.replace(object=jnp.int32(1)),
+        jax.tree.map(lambda a: a[1], slots._state.action),
+        over.replace(object=jnp.int32(2)),
+    ]
+    slots._state = slots._state.replace(action=jax.tree.map(lambda *a: jnp.stack(a), *done))
     slots.look(world, keys, [2, 0, 1])
     assert spy.acts == {0.1: 1, -0.075: 0, -0.09: 2}
     slots._state = slots._state.replace(belief=known)

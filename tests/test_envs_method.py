@@ -2,18 +2,19 @@
 
 import dataclasses
 import json
-import math
 import pickle
 
 import pytest
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.config.fixed import AS_IN_PAPER, FIXED
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.planner import OPTIONS, PRESETS, standard
+from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import DECISION_VERSION
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
@@ -38,19 +39,23 @@ def test_a_method_survives_the_way_to_a_worker(method):
 
 def test_options_are_flat_and_complete():
     options = METHODS[1].options()
-    assert {"policy", "recognition", "protocol", *(option.name for option in OPTIONS)} <= set(options)
+    assert {"policy", "recognition", *(option.name for option in OPTIONS)} <= set(options)
     assert options["policy"] == "my_lab.policies:Mine"
     assert options["push_distances"] == [0.05, 0.2]
     assert json.loads(json.dumps(options)) == options
     assert not any("." in name for name in options)
-    assert set(Method().options()) == {"policy", "recognition", "protocol", *(option.name for option in OPTIONS)}
+    assert set(Method().options()) == {"policy", "recognition", AS_IN_PAPER, *(option.name for option in OPTIONS)}
 
 
 def test_episodes_from_before_an_option_run_as_they_did():
-    former = standard(retrieval_tilts=(0.3, 0.4), retrieval_max_yaw=math.radians(45))
-    options = Method(config=former).options()
-    del options["retrieval_max_yaw"]
-    assert Method.of_options(options).config == former
+    """Of what was an option and is fixed now, a value of neither preset cannot be run again."""
+    for preset, which in PRESETS.items():
+        options = Method(config=which()).options()
+        del options[AS_IN_PAPER]
+        former = {name: getattr(fixed, "in_paper" if preset == "paper" else "value") for name, fixed in FIXED.items()}
+        assert Method.of_options({**options, **former}).config == which()
+    with pytest.raises(InputError, match="option draws is unknown to this version"):
+        Method.of_options({**Method().options(), "draws": 3})
 
 
 def test_what_is_no_option_tells_methods_apart_too():
@@ -61,7 +66,7 @@ def test_what_is_no_option_tells_methods_apart_too():
     unusual = {name: value for name, value in method.options().items() if "." in name}
     assert unusual.pop("problem.existence.found_pixels") == 80
     assert unusual.pop("problem.retrieval.yaw_step") == 0.5
-    assert set(unusual) == {f"problem.retrieval.{name}" for name in ("wrists", "antipodal")}
+    assert set(unusual) == {f"problem.retrieval.{name}" for name in ("wrists", "antipodal", "max_yaw")}
     assert Method.of_options(method.options()) == method
 
 

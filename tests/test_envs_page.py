@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 from recordings import (
     EPISODE,
-    FAR,
     LOST,
     OBJECTS,
     POSES,
@@ -29,8 +28,6 @@ from scipy.spatial.transform import Rotation
 from stage import HIDDEN
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.episode.protocols import REACHED
-from mechsearch_jax.envs.episode.records import record_action
 from mechsearch_jax.envs.page import page as pages
 from mechsearch_jax.envs.page.page import page, save_page, stamp
 from mechsearch_jax.envs.recording.recording import NAME, save_recording
@@ -200,16 +197,7 @@ def test_endings_are_those_of_the_record():
     assert of() == (False, "Lost: found, but not graspable", "found after 1 action")
     assert of(failure="retrieval: missed").title == "Lost: the hand missed the target"
     assert of(retrieved=True, failure=None)[:2] == (True, "Retrieved")
-    assert of(failure=REACHED)[:2] == (True, "Graspable")
     assert ending(RECORDING) == (None, "retrieved", "")
-
-
-def test_an_action_that_the_protocol_replaced_is_named():
-    steps = (dataclasses.replace(EPISODE.steps[0], action=record_action(FAR)), EPISODE.steps[1])
-    replaced = dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, failure=REACHED, steps=steps))
-    assert step_values(LOST, 0).executed == ""
-    assert step_values(replaced, 0).executed == "push object 0 by 20 cm to the left"
-    assert "Executed instead: push object 0 by 20 cm to the left" in Parsed(page(replaced)).words
 
 
 def test_a_policy_that_minds_no_cost_is_shown_none():

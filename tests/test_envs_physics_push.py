@@ -313,18 +313,18 @@ def test_each_draw_of_a_first_action_is_simulated_once_and_nothing_else(problem,
     for _, rows in ((plan, simulated), other):
         # All sequences at once, and as many calls as the one takes that draws most.
         assert rows[0].all()
-        assert 1 <= len(rows) <= config.first_draws
+        assert 1 <= len(rows) <= config.draws[0]
         assert rows.shape[1:] == (6,)
         assert (rows[1:] <= rows[:-1]).all()
 
     redraws_fail = True
     plan, simulated = decided(0)
-    assert len(simulated) == config.first_draws
+    assert len(simulated) == config.draws[0]
     assert simulated[0].all()
     # Those that have an action are not simulated again.
     has_none = int((plan.sequences.actions.kind[:, 0] == ActionKind.NONE).sum())
     assert 0 < has_none < 6
-    assert simulated[1:].sum(axis=1).tolist() == [has_none] * (config.first_draws - 1)
+    assert simulated[1:].sum(axis=1).tolist() == [has_none] * (config.draws[0] - 1)
 
 
 @pytest.mark.slow

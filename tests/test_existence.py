@@ -48,13 +48,36 @@ def every_scenario():
     return [s for s in loaded if s.target.shape == "cylinder"]
 
 
+class Coarse(ExistenceConfig):
+    """Without a closer look."""
+
+    looks_closer = False
+
+
+class NinePlaces(Coarse):
+    """Half-way to the corners of a cell, too."""
+
+    @property
+    def places(self):
+        return np.concatenate([super().places, ExistenceConfig(as_in_paper=True).places[1:]])
+
+
+class AnotherLook(ExistenceConfig):
+    """Visible as in the paper, at the default's places."""
+
+    looks_closer, places = False, ExistenceConfig().places
+
+    def __init__(self):
+        super().__init__(as_in_paper=True)
+
+
 def reference_existence(problem, objects, places, config):
     """Try the target at every place of every cell: count the pixels it shows, and look for points inside objects."""
     cam, target, shelf = problem.camera.scaled(config.step(problem.camera)), problem.target, problem.shelf
     scene_depth = reference_superquadric_depth(cam, objects)
     half = np.array(target.half_size)
     cloud = np.asarray(
-        superquadric.sample_surface(jnp.float32(half - config.erosion), jnp.float32(target.exponents), config.points),
+        superquadric.sample_surface(jnp.float32(half), jnp.float32(target.exponents), config.points),
         np.float64,
     )
     result = []
@@ -148,7 +171,7 @@ def test_a_closer_look_keeps_what_the_coarse_image_loses(problem, slivers):
 
 def test_without_a_closer_look_every_place_may_show_the_same(problem):
     objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
-    config = dataclasses.replace(problem.config.existence, closer_look=0)
+    config = Coarse()
     views = VIEWS(problem.existence, problem.camera, objects, None, config)
     closer = existence.closer_image(problem.camera, objects, views, config)
     allowed = existence.allowances(problem.existence, problem.camera, problem.target, views, closer, config)
@@ -156,14 +179,13 @@ def test_without_a_closer_look_every_place_may_show_the_same(problem):
 
 
 def test_places_are_the_middle_and_the_corners():
-    old = ExistenceConfig(cell_reach=(0.5,)).places
+    old = ExistenceConfig(as_in_paper=True).places
     np.testing.assert_array_equal(old[:, :2], [(0, 0), (-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
     assert not old[:, 2].any()
-    corners = ExistenceConfig(cell_reach=(1.0,)).places
+    corners = ExistenceConfig().places
     np.testing.assert_array_equal(np.abs(corners[1:]), 1.0)
     assert len(np.unique(corners, axis=0)) == 5
     assert corners[:, 2].sum() == 0.0
-    assert ExistenceConfig(cell_reach=()).places.shape == (1, 3)
 
 
 def test_the_cells_cover_the_board_up_to_its_walls(problem):
@@ -175,14 +197,14 @@ def test_the_cells_cover_the_board_up_to_its_walls(problem):
     np.testing.assert_allclose([high[:2], low[:2]], walls, atol=1e-6)
     inner = (np.abs(poses[:, :2] - poses[:, :2].mean(axis=0)) < np.ptp(poses[:, :2], axis=0) / 2 - 1e-3).all(axis=1)
     assert np.all(np.abs(places - poses[:, None])[inner] <= np.array(cell) / 2 + 1e-6)
-    half_way = target.places(shelf, ExistenceConfig(cell_reach=(0.5,)).places)
+    half_way = target.places(shelf, ExistenceConfig(as_in_paper=True).places)
     assert np.all(np.abs(half_way - poses[:, None]) <= np.array(cell) / 4 + 1e-6)
 
 
 @pytest.mark.slow
 def test_f_is_little_larger_than_what_must_stay_possible(problem):
     """Against nine places a cell, without margins, at a third of the camera's resolution instead of a seventh."""
-    exact = ExistenceConfig(cell_reach=(0.5, 1.0), closer_look=0, downscale=3, window=(110, 110))
+    exact = NinePlaces(downscale=3, window=(110, 110))
     tables = existence.existence_tables(problem.camera, problem.shelf, problem.target, exact)
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     allowed = jnp.full(tables.corner.shape[:2], exact.allowed(problem.camera))
@@ -356,20 +378,15 @@ def test_the_papers_criterion_lets_visible_targets_pass(problem):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(one.objects)
     ours = look(problem, objects).exists
-    other = look(problem.replace(config=planner.standard(criterion="depth-mse").problem), objects).exists
+    other = look(problem.replace(config=dataclasses.replace(problem.config, existence=AnotherLook())), objects).exists
     # A mean over the whole image hardly minds a few pixels.
     assert jnp.sum(other) > jnp.sum(ours)
 
 
 def test_bad_settings_are_refused_with_what_would_do():
-    with pytest.raises(InputError, match='"depth-norm" is unknown; use "detector" or "depth-mse"'):
-        ExistenceConfig(criterion="depth-norm")
-    with pytest.raises(InputError, match="downscale"):
-        ExistenceConfig(downscale=0)
-    with pytest.raises(InputError, match="closer_look 7 must be 0 or more and below downscale 7"):
-        ExistenceConfig(closer_look=7)
-    with pytest.raises(InputError, match="cell_reach"):
-        ExistenceConfig(cell_reach=(1.5,))
+    for downscale in (0, 3):
+        with pytest.raises(InputError, match=f"downscale {downscale} must be"):
+            ExistenceConfig(downscale=downscale)
 
 
 def test_the_candidate_poses_cover_the_board(problem):

@@ -1,6 +1,7 @@
 """The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
 
 import dataclasses
+import itertools
 import json
 
 import jax
@@ -24,10 +25,9 @@ from mechsearch_jax.graspability import pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner import rollout as rollouts
-from mechsearch_jax.planner.imitation import LaterPlacementsStay, in_the_present_scene
 from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
-from mechsearch_jax.planner.proposal import ALONE, DEPTH, as_predicted, blame, passed_on, sampling_weights
+from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, repeated, sequence_values
 from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.runtime.errors import InputError
@@ -105,36 +105,24 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "gamma": 0.9,
         "horizon": 1,
         "sequences": 100,
-        "unseen_contact_penalty": 1.0,
-        "guided_fraction": 0.7,
-        "crowding_weight": 0.02,
-        "draws": 1,
-        "first_draws": 4,
-        "move_again": False,
         "move_target": False,
         "retrieval_contact": True,
-        "predicted_collisions": False,
-        "imitates": "nothing",
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
-        "avoid_unseen": True,
-        "object_grasp_tilts": pytest.approx(np.radians([10, 20, 30]).tolist()),
-        "object_grasp_max_yaw": pytest.approx(np.radians(90)),
-        "criterion": "detector",
-        "cell_reach": [1.0],
-        "closer_look": 3,
-        "erosion": 0.0,
-        "reopen": True,
-        "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
-        "grasp_max_yaw": pytest.approx(np.radians(45)),
-        "retrieval_tilts": pytest.approx(np.radians([20, 25, 30]).tolist()),
-        "retrieval_max_yaw": pytest.approx(np.radians(75)),
         "push_model": "learned",
         "rehearsal": "physics",
         "max_steps": 10,
     }
     # What is no option.
+    search, problem = PlannerConfig(), planner.standard().problem
+    assert (search.unseen_contact_penalty, search.guided_fraction, search.crowding_weight) == (1.0, 0.7, 0.02)
+    assert search.draws == (4, 1)
+    assert not any(settings.as_in_paper for settings in (search, problem.existence, problem.actions))
+    degrees = [(20, 25, 30), 45, (20, 25, 30), 75, (10, 20, 30), 90]
+    angles = [(grasps.tilts, grasps.max_yaw) for grasps in (problem.grasps, problem.retrieval, problem.actions.grasps)]
+    for given, expected in zip(itertools.chain(*angles), degrees, strict=True):
+        np.testing.assert_allclose(np.degrees(given), expected)
     assert (ActionConfig().contact_tolerance, ActionConfig().topple) == (0.003, 0.5)
     assert (QuasiStatic().max_penetration, LearnedPush().max_penetration) == (0.006, 0.026)
     assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 41)
@@ -146,11 +134,11 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     search, actions = config.planner, config.problem.actions
     assert (search.horizon, search.sequences, config.max_steps) == (3, 30, 10)
     assert (search.guided_fraction, search.unseen_contact_penalty, search.crowding_weight) == (0.0, 0.0, 0.0)
-    assert (search.move_again, search.predicted_collisions) == (True, True)
     assert not search.move_target
-    assert search.draws > search.first_draws == 1
-    assert (config.problem.existence.erosion, config.problem.existence.reopen) == (0.0, False)
-    assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
+    assert search.draws == (8, 8)
+    assert search.as_in_paper
+    assert config.problem.existence.as_in_paper
+    assert actions.as_in_paper
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
     assert actions.push_directions == (np.pi / 2, -np.pi / 2)
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
@@ -160,28 +148,6 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     # Where the paper is silent.
     assert search.gamma == planner.standard().planner.gamma
     assert planner.paper(gamma=0.5).planner.gamma == 0.5
-
-
-def test_the_best_preset_is_the_standard_with_more_draws_and_actions():
-    assert planner.best() == planner.standard(draws=4, max_steps=20)
-    assert planner.best(max_steps=10, gamma=0.8) == planner.standard(draws=4, gamma=0.8)
-
-
-def test_the_preset_of_the_published_code_is_the_papers_but_for_two_settings():
-    changed = {"push_distances": (0.1,), "imitates": "published-code"}
-    assert planner.published_code() == planner.paper(**changed)
-    assert all(planner.paper().options()[name] != value for name, value in changed.items())
-
-
-@pytest.mark.parametrize("factory", [planner.search_for_grasp, planner.search_and_grasp, planner.greedy])
-def test_the_slots_of_the_published_code_are_chosen_by_one_name(factory):
-    own, published = factory(), factory(PlannerConfig(imitates="published-code"))
-    assert (own.drawn_in, published.drawn_in) == (as_predicted, in_the_present_scene)
-    assert published.predict == LaterPlacementsStay(own.predict)
-    assert isinstance(own.predict, PredictByKind)
-    assert (own.objective.hindrance, published.objective.hindrance) == (1.0, 0.1)
-    assert published.objective == dataclasses.replace(own.objective, hindrance=0.1)
-    assert published.propose == own.propose
 
 
 def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
@@ -194,40 +160,13 @@ def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
     def cost(objective, known):
         return float(objective.cost(problem, known, state, Weights()))
 
-    plain, light, none = (cost(SearchForGrasp(hindrance=h), belief) for h in (1.0, 0.1, 0.0))
-    assert none == exists.sum()
-    assert light - none == pytest.approx(0.1 * (plain - none), rel=1e-5)
-    assert cost(SearchAndGrasp(), belief) == exists.sum()
+    assert cost(SearchForGrasp(), belief) > cost(SearchAndGrasp(), belief) == exists.sum()
+    # Once it is found, the two differ in the pose itself alone.
     found_belief = belief.replace(found=jnp.array(True))
-    assert cost(SearchAndGrasp(hindrance=0.5), found_belief) == pytest.approx(
-        0.5 * cost(SearchAndGrasp(), found_belief)
-    )
+    assert cost(SearchForGrasp(), found_belief) == pytest.approx(cost(SearchAndGrasp(), found_belief) + 1.0)
 
 
-def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
-    _, objects = load("first-light")
-    state = rollout_of(problem, planner.initial_belief(problem)).root(objects)
-    ahead = jnp.float32([0.1, 0.0, 0.0])
-
-    def shifts(problem, state, sample, first):
-        scene = state.scene
-        after = scene.replace(position=scene.position + ahead[None])
-        return Prediction(after, scene.valid, jnp.array(True))
-
-    def shift(kind, first):
-        action = no_action().replace(kind=jnp.int32(kind))
-        sample = Sample(action, jnp.int32(0))
-        prediction = LaterPlacementsStay(shifts)(problem, state, sample, jnp.array(first))
-        assert bool(prediction.possible)
-        assert np.any(prediction.moved) == np.any(prediction.scene.position != state.scene.position)
-        return float(prediction.scene.position[0, 0] - state.scene.position[0, 0])
-
-    assert shift(ActionKind.PICK_AND_PLACE, False) == 0
-    for kind, first in ((ActionKind.PICK_AND_PLACE, True), (ActionKind.PUSH, True), (ActionKind.PUSH, False)):
-        assert shift(kind, first) == pytest.approx(0.1, abs=1e-6)
-
-
-def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(problem):
+def test_later_actions_are_drawn_in_the_predicted_scene(problem):
     _, objects = load("first-light")
     belief, shift = planner.initial_belief(problem), jnp.float32([0.0, 0.05, 0.0])
 
@@ -254,15 +193,12 @@ def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(prob
         def cost(self, state):
             return jnp.sum(state.scene.position[0])
 
-    def starts(drawn_in):
-        config = dataclasses.replace(CONFIG, horizon=3, sequences=2)
-        rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective, drawn_in)
-        planned = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
-        np.testing.assert_allclose(np.diff(planned.sequences.cost[0]), 0.05, atol=1e-6)
-        return np.asarray(planned.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
-
-    np.testing.assert_allclose(starts(as_predicted), [0.0, 0.05, 0.1], atol=1e-6)
-    np.testing.assert_allclose(starts(in_the_present_scene), 0.0, atol=1e-6)
+    config = dataclasses.replace(CONFIG, horizon=3, sequences=2)
+    rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective)
+    planned = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
+    np.testing.assert_allclose(np.diff(planned.sequences.cost[0]), 0.05, atol=1e-6)
+    starts = np.asarray(planned.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
+    np.testing.assert_allclose(starts, [0.0, 0.05, 0.1], atol=1e-6)
 
 
 def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(problem, root):
@@ -281,10 +217,9 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         alive = jax.vmap(lambda key: rollout.act(jnp.array(first), root, key)[0]["alive"])(keys)
         return float(jnp.mean(alive))
 
-    for draws, first_draws, first, later in ((1, 1, 1, 1), (1, 4, 4, 1), (3, 1, 3, 3), (2, 4, 4, 2)):
-        changes = {"draws": draws, "first_draws": first_draws}
-        assert share(True, **changes) == pytest.approx(1 - 0.7**first, abs=0.03)
-        assert share(False, **changes) == pytest.approx(1 - 0.7**later, abs=0.03)
+    for as_in_paper, first, later in ((False, 4, 1), (True, 8, 8)):
+        assert share(True, as_in_paper=as_in_paper) == pytest.approx(1 - 0.7**first, abs=0.03)
+        assert share(False, as_in_paper=as_in_paper) == pytest.approx(1 - 0.7**later, abs=0.03)
 
 
 @pytest.mark.parametrize("on_cpu", [True, False])
@@ -304,8 +239,7 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
         possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *seen, vmap_method="broadcast_all")
         return Prediction(state.scene, state.scene.valid, possible)
 
-    config = dataclasses.replace(CONFIG, draws=1, first_draws=draws)
-    rollout = Rollout(problem, planner.initial_belief(problem), config, counts, seldom, POLICY.objective)
+    rollout = Rollout(problem, planner.initial_belief(problem), CONFIG, counts, seldom, POLICY.objective)
     keys = jax.random.split(jax.random.key(0), rows)
     # The last is a sequence that has ended.
     states = repeated(root, rows).replace(alive=jnp.arange(rows) < rows - 1)
@@ -330,7 +264,7 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
 
 
 def test_options_are_changed_by_name_and_survive_json():
-    config = planner.standard(gamma=0.5, criterion="depth-mse", push_distances=(0.05, 0.2), max_steps=3)
+    config = planner.standard(gamma=0.5, push_model="quasi-static", push_distances=(0.05, 0.2), max_steps=3)
     again = planner.Config().with_options(**json.loads(json.dumps(config.options())))
     assert again == config
     with pytest.raises(InputError, match="option focus is unknown; there are gamma, "):
@@ -559,7 +493,7 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
 
     policy = dataclasses.replace(
         POLICY,
-        config=dataclasses.replace(CONFIG, unseen_contact_penalty=0.5, first_draws=1),
+        config=dataclasses.replace(CONFIG, unseen_contact_penalty=0.5),
         propose=somewhere,
         predict=lambda _, state, *__: Prediction(state.scene, state.scene.valid, jnp.array(True)),
     )
@@ -567,7 +501,8 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
     belief = decision[1]
     possible = possible_space(problem, belief, root.exists)
     probability = jax.jit(jax.vmap(lambda s: contact_probability(problem.space, root.scene, possible, s)))
-    share = np.asarray(probability(jax.vmap(somewhere)(keys)))
+    drawn = jax.vmap(lambda key: somewhere(jax.random.fold_in(key, 0)))(keys)
+    share = np.asarray(probability(drawn))
     assert len(np.unique(share)) > 2
     penalties = penalties_of(rollout_of(problem, belief, policy), root, keys)
     np.testing.assert_allclose(penalties, 0.5 * share, rtol=1e-6)
@@ -616,16 +551,14 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"gamma": 1.5}, "gamma 1.5"),
         ({"horizon": 0}, "horizon 0 must be at least 1"),
         ({"sequences": 0}, "sequences 0"),
-        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
-        ({"guided_fraction": -0.1}, "0 draws evenly"),
-        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
-        ({"unseen_contact_penalty": float("nan")}, "unseen_contact_penalty nan"),
-        ({"imitates": "me"}, 'imitates "me" is unknown; use nothing, published-code'),
-        ({"draws": 0}, "draws 0 must be at least 1"),
-        ({"first_draws": 0}, "first_draws 0 must be at least 1"),
+        ({"guided_fraction": 0.5}, "guided_fraction is no option any more: it is fixed at 0.7 .in preset paper at 0."),
+        ({"imitates": "me"}, "imitates is no option any more: it is fixed at nothing; leave it out"),
+        (
+            {"grasp_tilts": (0.1,)},
+            r"grasp_tilts is no option any more: it is fixed at 0.3491 0.4363 0.5236 \(in preset",
+        ),
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
-        ({"criterion": "guess"}, 'criterion "guess" is unknown'),
         ({"actions": ()}, "one or more kinds of action"),
     ],
 )
@@ -635,11 +568,24 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
 
 
 @pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
+        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
+        ({"crowding_weight": float("nan")}, "crowding_weight nan"),
+    ],
+)
+def test_what_is_no_option_is_checked_too(changes, message):
+    with pytest.raises(InputError, match=message):
+        PlannerConfig(**changes)
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         (
             "guess",
-            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, most-occluding, mctx',
+            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy',
         ),
         ("no_such_lab.policies:Mine", "cannot be imported .*no_such_lab"),
         ("mechsearch_jax.planner:Nobody", "cannot be imported .*Nobody"),
@@ -654,8 +600,7 @@ def test_policies_that_are_not_there_are_named(name, message):
 def test_policies_are_found_by_name_and_by_import_path():
     assert planner.policy_factory("search-and-grasp") is planner.search_and_grasp
     assert planner.policy_factory("mechsearch_jax.planner.policies:random_action") is planner.random_action
-    # One needs a library that not everybody has.
-    for factory in (factory for name, factory in planner.POLICIES.items() if name != "mctx"):
+    for factory in planner.POLICIES.values():
         assert factory(CONFIG, push_model=QuasiStatic()).predict.push_model == QuasiStatic()
 
 
@@ -667,7 +612,7 @@ def test_a_found_target_that_nothing_blocks_is_taken_out(problem):
         (planner.search_and_grasp, 0.0),
         (planner.random_action, 0.0),
         (planner.greedy, 0.0),
-        (planner.most_occluding, 0.0),
+        (planner.policy_factory("mechsearch_jax.benchmarks.policies.occlusion:most_occluding"), 0.0),
     ):
         decision = factory()(jax.random.key(0), problem, belief, seen(nothing, True, pose))
         assert int(decision.action.kind) == ActionKind.RETRIEVE
@@ -704,22 +649,6 @@ def test_a_greedy_policy_leaves_the_least_of_f(decision, problem):
     assert float(greedy.cost) == float(belief.exists.sum())
     assert float(greedy.predicted_cost) == left[acted].min() < float(greedy.cost)
     assert len(set(left[acted])) > 1
-
-
-@pytest.mark.slow
-def test_a_decision_with_the_settings_of_the_published_code_is_one_too(decision):
-    objects = decision[0]
-    config = planner.published_code(sequences=10)
-    problem = planner.build_problem(config=config.problem)
-    belief = planner.update_belief(problem, planner.initial_belief(problem), seen(objects))
-    published = planner.search_for_grasp(config.planner)(jax.random.key(0), problem, belief, seen(objects))
-    kinds, cost = np.asarray(published.sequences.actions.kind), np.asarray(published.sequences.cost)
-    later = kinds[:, 1:] == ActionKind.PICK_AND_PLACE
-    assert later.any()
-    np.testing.assert_array_equal(np.diff(cost, axis=1)[later], 0.0)
-    pushes = kinds == ActionKind.PUSH
-    distance = np.linalg.norm(np.asarray(published.sequences.actions.displacement), axis=-1)
-    np.testing.assert_allclose(distance[pushes], 0.1, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -153,8 +153,9 @@ def test_without_the_option_the_target_stays(problem, belief, objects):
 @pytest.mark.slow
 def test_a_found_target_is_pushed_where_that_frees_it(objects):
     # From farther to the side it is grasped past the box.
-    from_the_front = planner.standard(retrieval_max_yaw=np.radians(45)).problem
-    problem = planner.build_problem(config=from_the_front)
+    config = planner.standard().problem
+    from_the_front = dataclasses.replace(config.retrieval, max_yaw=np.radians(45))
+    problem = planner.build_problem(config=dataclasses.replace(config, retrieval=from_the_front))
     belief = planner.update_belief(problem, planner.initial_belief(problem), seen(objects))
     decision = POLICY(jax.random.key(0), problem, belief, seen(objects))
     # Since 100 first actions are compared, a push of object 0 that frees the target as well is among them.

@@ -11,16 +11,17 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.occlusion import (
+from mechsearch_jax.benchmarks.policies.occlusion import (
     EACH,
     NEXT,
     draw_by_occlusion,
+    most_occluding,
     most_occluding_first,
     occlusion_weights,
     weights_in_order,
 )
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
+from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import WeightedDraw, guided_draw
 from mechsearch_jax.runtime.identity import identity
@@ -29,7 +30,7 @@ from mechsearch_jax.workspace import scenario
 # Far from each other: one that hides much, one that hides less, one that hides little.
 SIZES = {"wide": ((0.03, 0.06, 0.08), 0.1), "narrow": ((0.025, 0.03, 0.06), 0.3), "low": ((0.02, 0.02, 0.05), -0.15)}
 ORDERS = (("wide", "narrow", "low"), ("low", "wide", "narrow"), ("narrow", "low", "wide"))
-POLICY = planner.most_occluding(push_model=QuasiStatic(), sequences=12)
+POLICY = most_occluding(push_model=QuasiStatic(), sequences=12)
 
 
 def body(name):

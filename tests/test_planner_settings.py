@@ -48,7 +48,7 @@ def test_the_example_holds_every_key_with_its_default(tmp_path):
 def test_the_example_of_the_guide_is_read(tmp_path):
     guide = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
     block, _ = re.findall(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
-    assert load(tmp_path, block).config == PRESETS["best"](gamma=0.8)
+    assert load(tmp_path, block).config == PRESETS["paper"](gamma=0.8)
     assert all(f"| `[{name}]` |" in guide for name in settings.tables())
 
 
@@ -162,7 +162,8 @@ WRONG = {
     "[objects]\nboxes = []\ncylinders = []": ":2: [objects] boxes and cylinders are both empty",
     "[objects]\nboxes = [[100, 50, 50]]": ":2: [objects] boxes (100.0, 50.0, 50.0) must be lengths in metres",
     '[planner]\npreset = "papr"': ':2: [planner] preset must be one of "standard", "paper"',
-    '[planner]\ncriterion = "eye"': ':2: [planner] criterion must be one of "detector"',
+    '[planner]\npush_model = "eye"': ':2: [planner] push_model must be one of "quasi-static"',
+    '[planner]\ncriterion = "detector"': ":2: [planner] criterion: criterion is no option any more: it is fixed",
     "[planner]\nhorizon = 3\ngamma = 3": ":3: [planner] gamma 3.0 is outside",
     '[planner]\nactions = ["fly"]': ':2: [planner] actions: "fly" is unknown',
     '[planner]\nactions = ["push", "paper"]': ":2: [planner] actions: paper is a whole set",
@@ -202,12 +203,12 @@ def options_of(tmp_path, text, *arguments):
 def test_the_command_line_goes_before_the_file(tmp_path):
     text = '[planner]\npreset = "paper"\ngamma = 0.5\nactions = ["standard"]\n[shelf]\nback = 0.8\n'
     options = PRESETS["standard"]().options()
-    standard = {name: options[name] for name in ("push_directions", "object_grasp_tilts", "object_grasp_max_yaw")}
+    standard = {name: options[name] for name in ("push_directions",)}
     given = options_of(tmp_path, text)
     assert given.settings().config == PRESETS["paper"](gamma=0.5, **standard)
     assert given.settings().workcell.shelf.back == 0.8
-    given = options_of(tmp_path, text, "--gamma", "0.7", "--preset", "best", "--push-directions", "0")
-    assert given.settings().config == PRESETS["best"](gamma=0.7, **{**standard, "push_directions": (0.0,)})
+    given = options_of(tmp_path, text, "--gamma", "0.7", "--preset", "standard", "--push-directions", "0")
+    assert given.settings().config == PRESETS["standard"](gamma=0.7, **{**standard, "push_directions": (0.0,)})
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.benchmarks.policies.tree_search import mctx, tree_plan, width
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
-from mechsearch_jax.planner.tree_search import tree_plan, width
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 
@@ -144,7 +144,7 @@ def test_a_node_has_fewer_actions_than_are_predicted(sequences, horizon, expecte
 
 
 def test_the_policy_is_known_by_its_name_and_keeps_the_slots():
-    policy = planner.policy_factory("mctx")(CONFIG)
+    policy = planner.policy_factory("mechsearch_jax.benchmarks.policies.tree_search:mctx")(CONFIG)
     assert policy.plan is tree_plan
     assert policy.objective == planner.search_for_grasp().objective
 
@@ -152,14 +152,14 @@ def test_the_policy_is_known_by_its_name_and_keeps_the_slots():
 def test_without_the_library_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "mctx", None)
     with pytest.raises(InputError, match=r"policy mctx needs .*pip install 'mechsearch-jax\[mctx\]'"):
-        planner.policy_factory("mctx")(CONFIG)
+        mctx(CONFIG)
 
 
 @pytest.mark.slow
 def test_a_decision_on_a_shelf(problem, objects):
     seen = Observation(objects, jnp.array(False), jnp.zeros(3))
     belief = planner.update_belief(problem, planner.initial_belief(problem), seen)
-    policy = planner.policy_factory("mctx")(sequences=8, horizon=2)
+    policy = mctx(sequences=8, horizon=2)
     decision = policy(jax.random.key(0), problem, belief, seen)
     assert int(decision.action.kind) in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
     assert float(decision.value) < 0

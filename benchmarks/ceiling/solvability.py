@@ -140,7 +140,7 @@ class Ceiling:
         sequences: sampled from each world of a round.
         """
         self._folder, self._config = Path(folder), config
-        self._planner: Config = PRESETS["best"](sequences=sequences, max_steps=config.max_steps)
+        self._planner: Config = PRESETS["standard"](sequences=sequences, max_steps=config.max_steps)
         self._simulator = NativeSimulator()
         self._problem = functools.cache(cached_problem)
         first, later = push_models(self._planner.push_model)

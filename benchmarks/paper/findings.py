@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PICK_AND_PLACE, PUSH, TABLES, paper_figures
 from mechsearch_jax.benchmarks.paper.reproduce import ANY, Results, Setting, ran_alike
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, share_interval
-from mechsearch_jax.benchmarks.statistics.outcomes import takes_out
 from mechsearch_jax.benchmarks.statistics.paired import reached_change, same_episodes, steps_change
 from mechsearch_jax.benchmarks.statistics.rates import scene_of, step_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
@@ -130,7 +129,7 @@ class Verdict(NamedTuple):
     """Whether a finding holds.
 
     Attributes:
-      part: preset, protocol and grasps.
+      part: preset and grasps.
       recognition: what the planner sees.
       goal: what counts as the paper's goal; see `goal_of`.
       change: here.
@@ -150,16 +149,16 @@ def goal_of(quantity: Quantity, setting: Setting, row: Row) -> str:
     """What counts as the paper's goal, of `rates.GOALS`.
 
     With trials the target is often taken out with a grasp that brushes something, before it is graspable; so it counts
-    there that it was taken out, unless only grasps that touch nothing are used, or the protocol takes nothing out.
+    there that it was taken out, unless only grasps that touch nothing are used.
     """
     if quantity.startswith("find"):
         return "found"
     trials = options_of(row).get("rehearsal", "none") != "none"
-    return "retrieved" if trials and setting.grasps == ANY and takes_out(row) else "graspable"
+    return "retrieved" if trials and setting.grasps == ANY else "graspable"
 
 
 def verdicts(finding: Finding, tables: Mapping[str, Results]) -> list[Verdict]:
-    """Whether a finding holds, for every preset, protocol and kind of grasps of which there are rows.
+    """Whether a finding holds, for every preset and kind of grasps of which there are rows.
 
     Args:
       finding: of the paper.

@@ -20,7 +20,7 @@ from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
 # What cells differ in. Differences are from the first value of each.
-FACTORS = ("method", "recognition", "actions", "preset", "protocol", "grasps")
+FACTORS = ("method", "recognition", "actions", "preset", "grasps")
 # Grasps that take the target out: any that is tried out first, or only those that touch nothing, the paper's; and the
 # option that says so.
 ANY, COLLISION_FREE, CONTACT = "any", "collision-free", "retrieval_contact"
@@ -37,14 +37,13 @@ class Setting(NamedTuple):
     recognition: str
     actions: tuple[str, ...]
     preset: str
-    protocol: str
     grasps: str = ANY
 
     @property
     def part(self) -> str:
         """What the cells of one part of a table have in common."""
         grasps = "" if self.grasps == ANY else f", {self.grasps} grasps"
-        return f"preset {self.preset}, protocol {self.protocol}{grasps}"
+        return f"preset {self.preset}{grasps}"
 
 
 class Mean(NamedTuple):
@@ -239,8 +238,8 @@ def _difference_line(difference: Difference) -> list[str]:
 
 
 def screen(results: Results) -> Group:
-    """The tables as they are printed, ours and the paper's figures without intervals: one for each preset, protocol and
-    set of actions."""
+    """The tables as they are printed, ours and the paper's figures without intervals: one for each preset and set of
+    actions."""
     parts: dict[tuple[str, str], list[Cell]] = {}
     for cell in results.cells():
         parts.setdefault((cell.setting.part, actions_text(cell.setting)), []).append(cell)

@@ -38,13 +38,13 @@ def _is_of(table: PaperTable, line: Mapping[str, Any]) -> bool:
 
 def setting_of(line: Mapping[str, Any]) -> Setting | None:
     """What a variant of a stored run's line is in a table; None where it is none of its cells."""
-    usual = {"policy": METHODS[1], "recognition": "oracle", "actions": list(BOTH), "protocol": "strict", CONTACT: True}
+    usual = {"policy": METHODS[1], "recognition": "oracle", "actions": list(BOTH), CONTACT: True}
     values = {**usual, **line["settings"]}
     if values.keys() != usual.keys() or values["policy"] not in METHODS:
         return None
     grasps = COLLISION_FREE if values[CONTACT] is False else ANY
     actions = tuple(values["actions"])
-    return Setting(values["policy"], values["recognition"], actions, line["preset"], values["protocol"], grasps)
+    return Setting(values["policy"], values["recognition"], actions, line["preset"], grasps)
 
 
 def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
@@ -91,11 +91,11 @@ def _rows_of(table: PaperTable, run: StoredRun) -> list[tuple[Setting, Row]]:
 
 
 def _order(setting: Setting) -> tuple[Any, ...]:
-    first = {"recognition": _RECOGNITIONS, "method": METHODS, "protocol": ("strict",), "preset": ("paper", "standard")}
+    first = {"recognition": _RECOGNITIONS, "method": METHODS, "preset": ("paper", "standard")}
 
     def place(factor: str) -> tuple[int, str]:
         value, values = getattr(setting, factor), first.get(factor, ())
         return values.index(value) if value in values else len(values), "+".join(value) if factor == "actions" else ""
 
     more = (len(setting.actions) < len(BOTH), *(place(factor) for factor in FACTORS if factor not in ("grasps",)))
-    return place("preset"), place("protocol"), setting.grasps, place("recognition"), place("method"), more
+    return place("preset"), setting.grasps, place("recognition"), place("method"), more

@@ -44,10 +44,13 @@ class FullResolution(ExistenceConfig):
     """
 
     downscale: int = 1
-    closer_look: int = 0
-    erosion: float = 0.0
     window: tuple[int, int] = (336, 336)
     side: int = 1
+
+    @property
+    def looks_closer(self) -> bool:
+        """Never."""
+        return False
 
     def step(self, camera: Camera) -> int:
         """As of `ExistenceConfig`."""

@@ -185,7 +185,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     method.check()
     workcell = method.workcell
     target = target_of(scenario, workcell.target)
-    problem = workcell.problem(target, method.problem_config)
+    problem = workcell.problem(target, method.config.problem)
     simulation = SimulatorConfig(trace_every=TRACE_EVERY)
     simulator = NativeSimulator(config=simulation, shelf=workcell.shelf, camera=workcell.camera)
     recorder = Recorder(simulator, problem)

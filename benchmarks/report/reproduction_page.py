@@ -30,7 +30,7 @@ from mechsearch_jax.benchmarks.paper.stored_tables import results_of_runs, runs_
 from mechsearch_jax.benchmarks.report.results_page import table
 from mechsearch_jax.benchmarks.report.store_run import rates_of
 from mechsearch_jax.benchmarks.statistics.intervals import with_interval
-from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS, takes_out
+from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes, steps_change
 from mechsearch_jax.benchmarks.statistics.rates import scene_of
 from mechsearch_jax.benchmarks.store.rows import Row
@@ -201,8 +201,7 @@ def difficulty_table(tables: Mapping[str, Results]) -> str:
         for setting, rows in results.rows.items():
             for row in rows:
                 scenes = groups.setdefault((name, setting.part, row.objects), {})
-                solved = row.retrieved if takes_out(row) else row.graspable_step is not None
-                scenes.setdefault(scene_of(row), []).append(solved)
+                scenes.setdefault(scene_of(row), []).append(row.retrieved)
     lines = []
     for (name, part, objects), scenes in groups.items():
         counts = collections.Counter(_column(sum(ends) / len(ends)) for ends in scenes.values())
@@ -218,7 +217,7 @@ def _column(share: float) -> str:
 
 
 def findings(tables: Mapping[str, Results]) -> list[dict[str, Any]]:
-    """The paper's findings in order, with a line for each preset, protocol and recognition of which there are rows."""
+    """The paper's findings in order, with a line for each preset and recognition of which there are rows."""
     return [
         {
             "text": finding.text,

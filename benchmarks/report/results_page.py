@@ -8,7 +8,6 @@ measured on the way to today's default is in docs/experiments.md, which is writt
 from __future__ import annotations
 
 import collections
-import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,12 +18,10 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, 
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, FROM_THE_FRONT, WITHIN_45, settings_of
+from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
-from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
-from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.files import PathLike
 
 Episode = Mapping[str, Any]
@@ -174,9 +171,9 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
-def _on_new_scenes(run: StoredRun, method: Method) -> list[Row]:
-    """The rows with the method's settings on scenes that nothing was chosen on; a later option was as it is usually."""
-    wanted = settings_of(method.options())
+def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[Row]:
+    """The rows with such settings on scenes that nothing was chosen on; a later option was as it is usually."""
+    wanted = Settings(preset, differing)
     rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
     return [row for row in rows if settings_of(options_of(row)) == wanted]
 
@@ -208,28 +205,22 @@ def default_rates(
 ) -> dict[str, Any]:
     """The fields of the template about what the default and the one before reach, with true shapes and from images;
     `beside` is of the one before, in the run of today's."""
-    former = Method(config=PRESETS["standard"](**FORMER_STANDARDS[WITHIN_45]))
-    former_masks, former_full = (dataclasses.replace(former, recognition=name) for name in ("masks", "full"))
-    front = Method(config=PRESETS["standard"](**FORMER_STANDARDS[FROM_THE_FRONT]))
-    front_grasps = dataclasses.replace(
-        front, recognition="masks", config=front.config.with_options(retrieval_contact=False)
-    )
-    new, new_full = (_on_new_scenes(today, Method(recognition=name)) for name in ("oracle", "full"))
-    old, old_full = (_on_new_scenes(before, method) for method in (former, former_full))
+    masks, full = {"recognition": "masks"}, {"recognition": "full"}
+    new, new_full = _on_new_scenes(today), _on_new_scenes(today, **full)
+    old, old_full = _on_new_scenes(before, WITHIN_45), _on_new_scenes(before, WITHIN_45, **full)
+    front_grasps = _on_new_scenes(collision_free, FROM_THE_FRONT, **masks, retrieval_contact=False)
     default = {**_named("`report-i`", new), **_named("before: `report-h`", old)}
     seen = _named("`full`, `report-i`", new_full)
-    free = _named(
-        "until 2026-11-28: `masks`, `c2`, collision-free grasps only", _on_new_scenes(collision_free, front_grasps)
-    )
+    free = _named("until 2026-11-28: `masks`, `c2`, collision-free grasps only", front_grasps)
     return {
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps({**default, **seen}),
         "image_rates": rates(
             "recognition",
             {
-                **_named("before: `masks`, `c2`", _on_new_scenes(table1, former_masks)),
+                **_named("before: `masks`, `c2`", _on_new_scenes(table1, WITHIN_45, **masks)),
                 **free,
-                **_named("before: `full`, `c2`", _on_new_scenes(table1, former_full)),
+                **_named("before: `full`, `c2`", _on_new_scenes(table1, WITHIN_45, **full)),
                 **seen,
             },
         ),

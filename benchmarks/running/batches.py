@@ -151,14 +151,13 @@ class Batches:
 
         run_episodes(
             map(start, batch.jobs(means.worlds)),
-            method.workcell.problem(target, method.problem_config),
+            method.workcell.problem(target, method.config.problem),
             policy_of(method),
             means.simulator,
             means.worlds,
             Listeners(take, self.busy, self.compiling),
             RunSettings(
                 recogniser=method.recogniser(target),
-                protocol=method.terms,
                 trials=means.trials,
                 at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             ),

@@ -49,7 +49,7 @@ class InTurn:
         target = target_of(scenario, workcell.target)
         episode = run_episode(
             Start(scenario, job.seed, mismatch=method.mismatch),
-            self._problem(workcell, target, method.problem_config),
+            self._problem(workcell, target, method.config.problem),
             self._policy(method),
             self._simulator(workcell),
             run_settings(method, target),
@@ -67,7 +67,6 @@ def run_settings(method: Method, target: Target) -> RunSettings:
         recogniser=method.recogniser(target),
         max_steps=method.config.max_steps,
         options=method.options(),
-        protocol=method.terms,
         trials=method.trials(),
     )
 

@@ -27,8 +27,8 @@ RESULTS = Path("benchmarks/results")
 OUT = Path("docs/scene-sets")
 MEASURES = ("retrieved", "found", "graspable")
 # What variants on a set's page may differ in; others belong to studies.
-SHOWN = ("policy", "recognition", "protocol", "actions", "rehearsal", "retrieval_contact")
-_PRESETS = ("standard", *FORMER_STANDARDS, "best", "published-code", "paper")
+SHOWN = ("policy", "recognition", "actions", "rehearsal", "retrieval_contact")
+_PRESETS = ("standard", *FORMER_STANDARDS, "paper")
 _WORDS = {
     "rehearsal=none": "without trials",
     "rehearsal=learning": "with trials that learn the friction",
@@ -60,8 +60,6 @@ def label(line: Line) -> str:
     settings = dict(line["settings"])
     words = [f"`{line['preset']}`"]
     words += [f"`{settings[name]}`" for name in ("policy", "recognition") if name in settings]
-    if "protocol" in settings:
-        words.append(f"protocol `{settings['protocol']}`")
     if "actions" in settings:
         *kinds, last = settings["actions"]
         words.append((", ".join(kinds) + " and " if kinds else "") + f"{last} alone")
@@ -92,9 +90,8 @@ def rates_of(line: Line) -> Mapping[str, Any]:
 
 
 def _order(line: Line) -> tuple[Any, ...]:
-    settings = line["settings"]
     preset = _PRESETS.index(line["preset"]) if line["preset"] in _PRESETS else len(_PRESETS)
-    return preset, settings.get("protocol", ""), label(line), line["run"]
+    return preset, label(line), line["run"]
 
 
 def _by_variant(lines: Iterable[Line]) -> dict[tuple[str, str], dict[int, Line]]:
@@ -304,7 +301,7 @@ digest of what its scenes hold.
 ## How to read the rates
 
 Every row on a set's page is a variant of a [stored run](../commands.md#stored-runs): a preset and what differs from it,
-which has search-for-grasp, true shapes, [protocol](../method.md#protocols) `strict` and the simulator
+which has search-for-grasp, true shapes and the simulator
 `{_USUAL_SIMULATOR}` where it does not say otherwise. Columns are numbers of objects. A cell is a share of episodes,
 with a 95% interval that knows that [seeds of a scene are alike](../commands.md#reports). [What the words
 mean](../method.md#verdicts).

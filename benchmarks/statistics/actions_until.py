@@ -21,7 +21,6 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_intervals
-from mechsearch_jax.benchmarks.statistics.outcomes import takes_out
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, scene_of, step_of, with_totals
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
@@ -45,19 +44,14 @@ def horizon_of(goal: str, budget: int) -> int:
     return budget + (goal == "retrieved")
 
 
-def restricted_steps(row: Row, goal: str, budget: int) -> int | None:
+def restricted_steps(row: Row, goal: str, budget: int) -> int:
     """Actions until a goal, at most as many as its horizon, which also stands for never.
 
     Args:
       row: of the episode; one that ended in an error never reaches a goal.
       goal: one of `GOALS`.
       budget: of actions, not above the episode's own.
-
-    Returns:
-      None where the goal is to take the target out, and the episode's protocol never does.
     """
-    if goal == "retrieved" and not takes_out(row):
-        return None
     horizon, step = horizon_of(goal, budget), step_of(row, goal)
     return horizon if step is None else min(step, horizon)
 
@@ -76,18 +70,18 @@ class RestrictedMeans:
       group: as in `Rates`.
       episodes: how many episodes.
       budget: of actions; the horizon of `retrieved` is one more.
-      found, graspable, retrieved: the means; None where no episode's protocol has the goal.
+      found, graspable, retrieved: the means.
       found_interval, graspable_interval, retrieved_interval: what the true means may be: see `mean_interval`.
     """
 
     group: Mapping[str, Hashable]
     episodes: int
     budget: int
-    found: float | None
+    found: float
     found_interval: Interval | None
-    graspable: float | None
+    graspable: float
     graspable_interval: Interval | None
-    retrieved: float | None
+    retrieved: float
     retrieved_interval: Interval | None
 
     @property
@@ -117,12 +111,11 @@ def restricted_means(
     for place, (group, members) in zip(range(0, len(samples), len(GOALS)), groups, strict=True):
         fields: dict[str, Any] = {}
         for goal, (steps, _), interval in zip(GOALS, samples[place:], intervals[place:], strict=False):
-            fields |= {goal: sum(steps) / len(steps) if steps else None, f"{goal}_interval": interval}
+            fields |= {goal: sum(steps) / len(steps), f"{goal}_interval": interval}
         means.append(RestrictedMeans(group, len(members), budget, **fields))
     return means
 
 
 def _steps_and_scenes(rows: Sequence[Row], goal: str, budget: int) -> tuple[list[int], list[Hashable]]:
-    """The restricted actions until a goal and the scene of each episode whose protocol has the goal."""
-    ends = [(steps, scene_of(row)) for row in rows if (steps := restricted_steps(row, goal, budget)) is not None]
-    return [steps for steps, _ in ends], [scene for _, scene in ends]
+    """The restricted actions until a goal and the scene of each episode."""
+    return [restricted_steps(row, goal, budget) for row in rows], [scene_of(row) for row in rows]

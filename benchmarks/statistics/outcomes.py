@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
-
-
-def takes_out(row: Row) -> bool:
-    """Whether the episode's protocol takes a target out, and leaves on the floor what fell."""
-    return options_of(row).get("protocol", "strict") == "strict"
+from mechsearch_jax.benchmarks.store.rows import Row
 
 
 def _drop_free(row: Row) -> bool | None:
-    if not takes_out(row) or (row.objects_fallen is None and not row.is_error):
-        return None
-    return row.objects_fallen == 0
+    return None if row.objects_fallen is None and not row.is_error else row.objects_fallen == 0
 
 
 # What an episode reaches, by what stored runs call it; None where a row does not say. An error reaches nothing.
@@ -23,7 +16,7 @@ OUTCOMES: Mapping[str, Callable[[Row], bool | None]] = {
     "found": lambda row: row.found_step is not None,
     "graspable": lambda row: row.graspable_step is not None,
     "paper_graspable": lambda row: row.paper_graspable,
-    "retrieved": lambda row: row.retrieved if takes_out(row) else None,
+    "retrieved": lambda row: row.retrieved,
     "drop_free": _drop_free,
 }
 # The same in the words of pages.

@@ -7,13 +7,14 @@ import json
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from mechsearch_jax.config.fixed import without_fixed
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
 # Options beside those of presets, with their usual values; and those whose values say what they are of.
 USUAL: Mapping[str, Any] = {
     "policy": "search-for-grasp",
     "recognition": "oracle",
-    "protocol": "strict",
     "target": "cylinder",
 }
 PLAIN = ("policy", "recognition", "target")
@@ -46,7 +47,7 @@ def preset_name(options: Mapping[str, Any], text: Any) -> PresetName | None:
     Returns:
       The name; None if the options do not tell one preset from another.
     """
-    presets = _presets()
+    options, presets = without_fixed(options), _presets()
     if any(name not in options for name in _telling()):
         return None
     deviating = {preset: _deviating(options, values) for preset, values in presets.items()}
@@ -68,7 +69,7 @@ def named_once(names: Mapping[str, PresetName | None]) -> dict[str, PresetName]:
 @functools.cache
 def _presets() -> dict[str, dict[str, Any]]:
     """The options of each preset."""
-    return {name: {**preset().options(), **USUAL} for name, preset in PRESETS.items()}
+    return {name: {**Method(config=preset()).options(), **USUAL} for name, preset in PRESETS.items()}
 
 
 @functools.cache

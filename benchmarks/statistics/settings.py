@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from mechsearch_jax.config.fixed import without_fixed
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
@@ -17,15 +18,15 @@ FROM_THE_FRONT = "standard until 2026-11-28"
 THREE_AHEAD = "standard until 2026-11-26"
 _RETRIEVALS_WITHIN_45 = {
     "retrieval_max_yaw": math.radians(45),
-    "retrieval_tilts": tuple(map(math.radians, (20.0, 22.5, 25.0, 27.5, 30.0))),
+    "retrieval_tilts": list(map(math.radians, (20.0, 22.5, 25.0, 27.5, 30.0))),
 }
 _FRONT_GRASPS = {
     "object_grasp_max_yaw": math.radians(45),
-    "object_grasp_tilts": (math.radians(20), math.radians(30)),
+    "object_grasp_tilts": list(map(math.radians, (20.0, 30.0))),
     **_RETRIEVALS_WITHIN_45,
 }
-# What preset `standard` was before, the latest first: by the name that it has since, the options that were other than
-# today's.
+# What preset `standard` was before, the latest first: by the name that it has since in stored results, the options that
+# were other than today's, some of which are none any more.
 FORMER_STANDARDS: Mapping[str, Mapping[str, Any]] = {
     WITHIN_45: _RETRIEVALS_WITHIN_45,
     FROM_THE_FRONT: _FRONT_GRASPS,
@@ -40,7 +41,7 @@ class Settings(NamedTuple):
 
     Attributes:
       preset: the preset that differs from them in the fewest options, or one of `FORMER_STANDARDS`.
-      differing: what is not as in that preset, with search-for-grasp, true shapes and protocol strict; None is the
+      differing: what is not as in that preset, with search-for-grasp and true shapes; None is the
         value of an option that the variant does not have.
     """
 
@@ -50,8 +51,9 @@ class Settings(NamedTuple):
 
 @functools.cache
 def _preset_options(name: str) -> Mapping[str, Any]:
-    config = PRESETS["standard"](**FORMER_STANDARDS[name]) if name in FORMER_STANDARDS else PRESETS[name]()
-    return Method(config=config).options()
+    if name in FORMER_STANDARDS:
+        return {**Method().options(), **FORMER_STANDARDS[name]}
+    return Method(config=PRESETS[name]()).options()
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -59,7 +61,7 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
 
     An option that the row does not have is of a later version, and is taken to be as in the preset.
     """
-    names = (*PRESETS, *FORMER_STANDARDS)
+    options, names = without_fixed(options), (*PRESETS, *FORMER_STANDARDS)
     candidates = [Settings(name, _differing(options, _preset_options(name))) for name in names]
     return min(candidates, key=lambda settings: len(settings.differing))
 

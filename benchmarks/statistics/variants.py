@@ -11,6 +11,7 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.statistics.preset_names import PresetName, named_once, preset_name
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
+from mechsearch_jax.config.fixed import without_fixed
 from mechsearch_jax.runtime.errors import InputError, nearest
 
 # A label that is longer does not fit into a table or a picture; variants are numbered then.
@@ -43,7 +44,8 @@ def _options_of_variants(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, dict
     """For each row its variant, and for each variant its options."""
     variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
-    return variants, {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    each = dict(zip(variants, rows, strict=True)).items()
+    return variants, {variant: without_fixed(options_of(row)) for variant, row in each}
 
 
 def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:

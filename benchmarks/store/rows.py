@@ -15,6 +15,7 @@ from typing import Any, Protocol, get_args, get_origin, get_type_hints
 import pyarrow
 import pyarrow.parquet
 
+from mechsearch_jax.config.fixed import AS_IN_PAPER
 from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.runtime.errors import InputError
@@ -244,8 +245,8 @@ EPISODE = "episode"
 # Columns for who reads the table with something else; a row has all of it in its other fields.
 _MORE = {
     **{option.name: _column(option.type) for option in PLANNER_OPTIONS if option.name not in _FIELDS},
+    AS_IN_PAPER: pyarrow.bool_(),
     "simulator": pyarrow.string(),
-    "protocol": pyarrow.string(),
     EPISODE: pyarrow.string(),
 }
 SCHEMA = pyarrow.schema([*_FIELDS.items(), *_MORE.items()])

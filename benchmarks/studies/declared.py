@@ -1,27 +1,23 @@
 """The studies that there are.
 
-Ablations run on `development`, since they choose what the default has, and `extensions-full`, which chooses, too, on
-scenes that were looked at before; all others on scenes that nothing was chosen on. Those of before a default changed
-are around the former one: what is stored of them is of it, and so is what runs again.
+Ablations run on `development`, since they choose what the default has; all others on scenes that nothing was chosen on.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS, FROM_THE_FRONT, THREE_AHEAD
 from mechsearch_jax.benchmarks.studies.robustness import IMAGE_SCENES, REPORT_SCENES, ROBUSTNESS
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 from mechsearch_jax.envs.world.mismatch import Mismatch
-from mechsearch_jax.planner import expanded
 
 ABLATION_SCENES = "development"
-# A set for each later question, since a set that was looked at is no longer unseen.
-CONFIRMATION_SCENES, DEFAULT_SCENES = "report-c", "report-d"
+DEFAULT_SCENES = "report-d"
 STANDARD = Variant("standard")
+# Where policies to compare with are that no command has a name for.
+POLICIES = "mechsearch_jax.benchmarks.policies"
 
 
 def _degrees(*angles: int) -> tuple[float, ...]:
@@ -58,7 +54,6 @@ _ABLATIONS = (
             Variant("sequences 3000", {"sequences": 3000}, value=3000.0, scenes=25),
         ),
         axis="sequences",
-        logarithmic=True,
     ),
     Study(
         "actions",
@@ -76,7 +71,6 @@ _ABLATIONS = (
             Variant("no push of 5 cm", {"push_distances": (0.10, 0.15)}),
             Variant("no push of 10 cm", {"push_distances": (0.05, 0.15)}),
             Variant("no push of 15 cm", {"push_distances": (0.05, 0.10)}),
-            Variant("objects grasped at 20° only", {"object_grasp_tilts": _degrees(20)}),
         ),
     ),
     Study(
@@ -87,21 +81,7 @@ _ABLATIONS = (
             STANDARD,
             Variant("no trials", {"rehearsal": "none"}),
             Variant("collision-free grasps only", {"retrieval_contact": False}),
-            Variant("no penalty of unseen contact", {"unseen_contact_penalty": 0.0}),
-            Variant("even draws", {"guided_fraction": 0.0}),
-            Variant("no weight of crowding", {"crowding_weight": 0.0}),
-            Variant("one draw of the first action", {"first_draws": 1}),
-            Variant("objects may move again", {"move_again": True}),
-            Variant("a found target stays", {"move_target": False}),
-            Variant("collisions in predictions", {"predicted_collisions": True}),
-            Variant("unseen space not avoided", {"avoid_unseen": False}),
-            Variant("no margin of a cell", {"cell_reach": (0.5,)}),
-            Variant("no closer look", {"closer_look": 0}),
-            Variant("no erosion", {"erosion": 0.0}),
-            Variant("f never reopened", {"reopen": False}),
-            Variant("g at 20° only", {"grasp_tilts": _degrees(20)}),
-            Variant("found target at 20° only", {"retrieval_tilts": _degrees(20)}),
-            Variant("f by mean squared depth", {"criterion": "depth-mse"}),
+            Variant("a found target may be pushed", {"move_target": True}),
             Variant("preset paper", {"preset": "paper"}),
         ),
     ),
@@ -120,7 +100,7 @@ _ABLATIONS = (
         "steps",
         "How much do twice as many actions gain?",
         ABLATION_SCENES,
-        (Variant("10 actions"), Variant("20 actions", {"max_steps": 20}), Variant("best", {"preset": "best"})),
+        (Variant("10 actions"), Variant("20 actions", {"max_steps": 20})),
     ),
     Study(
         "recognition",
@@ -149,13 +129,8 @@ _ABLATIONS = (
     ),
 )
 
-# What gained nothing on `development`, each by itself, and could be left out of the default.
-_LEFT_OUT = {"reopen": False, "closer_look": 0, "erosion": 0.0, "cell_reach": (0.5,), "move_target": False}
-
-# What may take the default's place: it looks one action ahead, and leaves two extensions out.
-_THREE_AHEAD = FORMER_STANDARDS[THREE_AHEAD]
-_ONE_AHEAD = {"horizon": 1, "sequences": 300, "move_target": False, "erosion": 0.0}
 _FULL = {"recognition": "full"}
+_THREE_AHEAD = {"horizon": 3, "sequences": 30, "move_target": True}
 
 _CONFIRMATIONS = (
     Study(
@@ -168,52 +143,8 @@ _CONFIRMATIONS = (
             Variant("full", {"recognition": "full"}),
         ),
     ),
-    Study(
-        "confirmation",
-        "Which differences of the ablations hold on scenes that nothing was chosen on?",
-        CONFIRMATION_SCENES,
-        (
-            STANDARD,
-            Variant("20 actions", {"max_steps": 20}),
-            Variant("horizon 1", {"horizon": 1}),
-            Variant("horizon 1, 300 sequences", {"horizon": 1, "sequences": 300}),
-            Variant("gamma 0.5", {"gamma": 0.5}),
-            Variant("300 sequences", {"sequences": 300}),
-            Variant("f never reopened", {"reopen": False}),
-            Variant("what gained nothing left out", _LEFT_OUT),
-            Variant("full", {"recognition": "full"}),
-            Variant("full, what gained nothing left out", {"recognition": "full", **_LEFT_OUT}),
-        ),
-    ),
-    Study(
-        "extensions-full",
-        "What does each extension gain through images, when it alone is left out?",
-        CONFIRMATION_SCENES,
-        (
-            Variant("full", _FULL),
-            Variant("collision-free grasps only", {**_FULL, "retrieval_contact": False}),
-            Variant("a found target stays", {**_FULL, "move_target": False}),
-            Variant("no margin of a cell", {**_FULL, "cell_reach": (0.5,)}),
-            Variant("no erosion", {**_FULL, "erosion": 0.0}),
-            Variant("f never reopened", {**_FULL, "reopen": False}),
-            Variant("one ahead, 300 sequences", {**_FULL, "horizon": 1, "sequences": 300}),
-        ),
-        chooses=True,
-    ),
-    Study(
-        "one-ahead",
-        "Is it as good to look one action ahead, with more of them, and to leave out what gained nothing?",
-        DEFAULT_SCENES,
-        (
-            Variant("three ahead, full", {**_FULL, **_THREE_AHEAD}),
-            Variant("one ahead, full", {**_FULL, **_ONE_AHEAD}),
-            Variant("three ahead, true shapes", _THREE_AHEAD),
-            Variant("one ahead, true shapes", _ONE_AHEAD),
-        ),
-    ),
 )
 
-# Around the default that looks one action ahead.
 _ONE_AHEAD_STUDIES = (
     Study(
         "first-actions",
@@ -227,7 +158,6 @@ _ONE_AHEAD_STUDIES = (
             Variant("300, true shapes", {"sequences": 300}),
             Variant("30 of three actions, true shapes", _THREE_AHEAD),
         ),
-        chooses=True,
     ),
 )
 
@@ -241,10 +171,9 @@ _BASELINES = (
             Variant("search-and-grasp", policy="search-and-grasp"),
             Variant("random", policy="random"),
             Variant("greedy", policy="greedy"),
-            Variant("most-occluding", policy="most-occluding"),
-            Variant("mctx", policy="mctx"),
+            Variant("most-occluding", policy=f"{POLICIES}.occlusion:most_occluding"),
+            Variant("mctx", policy=f"{POLICIES}.tree_search:mctx"),
             Variant("preset paper", {"preset": "paper"}),
-            Variant("preset published-code", {"preset": "published-code"}),
             Variant("no trials", {"rehearsal": "none"}),
             Variant("10 sequences", {"sequences": 10}),
             Variant("300 sequences", {"sequences": 300}),
@@ -253,20 +182,8 @@ _BASELINES = (
             Variant("collision-free", {"retrieval_contact": False}),
             Variant("informed, collision-free", {"recognition": "informed", "retrieval_contact": False}),
         ),
-        by_time=True,
     ),
 )
-
-
-def _around(former: str, studies: Sequence[Study]) -> tuple[Study, ...]:
-    """Studies around a former default, of which presets `standard` and `best` were made."""
-    before = FORMER_STANDARDS[former]
-
-    def own(variant: Variant) -> Variant:
-        made_of_it = variant.options.get("preset", "standard") in ("standard", "best")
-        return dataclasses.replace(variant, options={**(before if made_of_it else {}), **expanded(variant.options)})
-
-    return tuple(dataclasses.replace(s, variants=tuple(map(own, s.variants)), around=former) for s in studies)
 
 
 def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
@@ -275,9 +192,9 @@ def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
 
 # By what they are for, in the order of the page.
 GROUPS: Mapping[str, Sequence[Study]] = {
-    "Ablations": _around(THREE_AHEAD, _ABLATIONS),
-    "On new scenes": (*_around(THREE_AHEAD, _CONFIRMATIONS), *_around(FROM_THE_FRONT, _ONE_AHEAD_STUDIES)),
-    "Baselines": _around(THREE_AHEAD, _BASELINES),
-    "Robustness": _around(THREE_AHEAD, ROBUSTNESS),
+    "Ablations": _ABLATIONS,
+    "On new scenes": (*_CONFIRMATIONS, *_ONE_AHEAD_STUDIES),
+    "Baselines": _BASELINES,
+    "Robustness": ROBUSTNESS,
 }
 STUDIES: Mapping[str, Study] = _by_name(*GROUPS.values())

@@ -26,7 +26,7 @@ def _by_factor(name: str, question: str, axis: str, world: Callable[[float], Mis
         Variant(f"{name.partition('-')[0]} x {factor:g}", {**options, "mismatch": world(factor)}, value=factor)
         for factor in (1.0, 0.5, 0.7, 1.4, 2.0)
     )
-    return Study(name, question, REPORT_SCENES, variants, axis=axis, logarithmic=True)
+    return Study(name, question, REPORT_SCENES, variants, axis=axis)
 
 
 _USUAL_WORLD = {"as assumed": Mismatch()}

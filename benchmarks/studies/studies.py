@@ -20,7 +20,7 @@ from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.runtime.errors import InputError, nearest
 
 # Options of a variant that are no options of the planner, by their fields of `Method`.
-_OF_METHODS = ("recognition", "protocol", "mismatch")
+_OF_METHODS = ("recognition", "mismatch")
 # Columns that say what an episode ran with.
 _ran_with = operator.attrgetter("configuration", *OPTIONS)
 
@@ -32,7 +32,7 @@ class Variant:
     Attributes:
       label: in tables and pictures.
       options: how it differs from `search-for-grasp` in preset `standard` with true shapes: the planner's options by
-        name, `preset`, and fields of `Method` (`recognition`, `protocol`, `mismatch`).
+        name, `preset`, and fields of `Method` (`recognition`, `mismatch`).
       policy: its name.
       value: its place on the study's axis, where that is a number.
       config: a configuration file of another camera; the default one's settings if None.
@@ -70,10 +70,6 @@ class Study:
       scenes: name of a scene set.
       variants: the first is what the others are compared with.
       axis: what `Variant.value` is, in words and with its unit; None where variants are not on an axis.
-      logarithmic: whether the axis is.
-      by_time: whether its picture shows success against planning time.
-      chooses: whether a default is chosen by it, so that its scenes are no longer ones that nothing was chosen on.
-      around: the former default around which its variants are, one of `settings.FORMER_STANDARDS`; None for today's.
     """
 
     name: str
@@ -81,10 +77,6 @@ class Study:
     scenes: str
     variants: tuple[Variant, ...]
     axis: str | None = None
-    logarithmic: bool = False
-    by_time: bool = False
-    chooses: bool = False
-    around: str | None = None
 
     @property
     def baseline(self) -> Variant:

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int, UInt
 
+from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.camera.sensing import Sensing, sensing_of
 from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
 from mechsearch_jax.envs.episode.compile_clock import CompileClock, StageClock
@@ -26,20 +27,18 @@ from mechsearch_jax.envs.episode.episode_log import (
 )
 from mechsearch_jax.envs.episode.moments import Moment, Watcher
 from mechsearch_jax.envs.episode.numbering import named_decision, named_observation, named_tried
-from mechsearch_jax.envs.episode.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.simulator import Flowing, Simulator
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ActualCell, Mismatch
+from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.planner import Policy, Problem
 from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.scenario import Scenario
-
-STRICT = Strict()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +78,6 @@ class RunSettings:
       recogniser: what the policy sees the world through; with several slots it has to be traceable, as the policy.
       max_steps: actions in an episode; afterwards the target may still be taken out.
       options: what the records keep of how the episodes were run, beside target, simulator and seed.
-      protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
       trials: what tries the policy's best actions out before one is made; nothing if left out.
       at_once: how many slots look or decide in one computation.
     """
@@ -87,7 +85,6 @@ class RunSettings:
     recogniser: Recogniser = oracle
     max_steps: int = 10
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    protocol: EpisodeProtocol = STRICT
     trials: Trials | None = None
     at_once: int = 64
 
@@ -201,10 +198,9 @@ class EpisodePool:
             if not logs[r].last or takes_target(choice)
         }
         with clock("judge", to_judge):
-            verdicts = self._settings.protocol.judge(self._planner, world, to_judge)
+            verdicts = self._planner.judge(world, to_judge)
 
         trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
-        trouble |= self._settings.protocol.ends(self._problem.shelf, world, list(logs), verdicts, choices)
         for r, log in logs.items():
             # Where an object has left the board, an episode goes on for what else is to be known of it, no further.
             verdict = verdicts.get(r, Verdict())
@@ -231,21 +227,18 @@ class EpisodePool:
         moment = self._moment(choices)
         if self._listeners.watcher is not None and moment is not None and acting:
             self._listeners.watcher.decided(moment)
-        executed: Execution | None = None
+        outcome: Outcome | None = None
+        over: dict[int, Choice] = {}
         with self._clock("simulate", [*acting, *self._moving]):
             if acting or self._moving:
-                executed = self._executed({r: choices[r] for r in acting})
-                others = {r: choice for r, choice in executed.choices.items() if choice is not choices.get(r, choice)}
-                self._planner.took({r: choice.action for r, choice in others.items()})
-                for r, choice in others.items():
-                    decided[r].log.took(choice)
+                outcome, over = self._executed({r: choices[r] for r in acting})
 
         # Without an action there is nothing to wait for.
         ends: dict[int, tuple[Result | None, str | None]] = {
             r: (None, trouble.get(r)) for r in decided if r not in acting
         }
-        if executed is not None:
-            ends |= {r: self._result(executed, r) for r in executed.choices.keys() | executed.stuck}
+        if outcome is not None:
+            ends |= {r: self._result(choice, outcome, r) for r, choice in over.items()}
         done: list[tuple[int, tuple[int, Episode]]] = []
         for r, (result, why) in sorted(ends.items()):
             slot = self.running[r]
@@ -253,29 +246,27 @@ class EpisodePool:
                 done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
                 self._slots[r] = None
         if self._listeners.watcher is not None and moment is not None:
-            outcome = None if executed is None else jax.tree.map(lambda a: a[0], executed.outcome)
-            self._listeners.watcher.acted(dataclasses.replace(moment, record=decided[0].log.steps[-1], outcome=outcome))
+            of_slot = None if outcome is None else jax.tree.map(lambda a: a[0], outcome)
+            self._listeners.watcher.acted(dataclasses.replace(moment, record=decided[0].log.steps[-1], outcome=of_slot))
         return done
 
-    def _result(self, executed: Execution, row: int) -> tuple[Result | None, str | None]:
+    def _result(self, choice: Choice, outcome: Outcome, row: int) -> tuple[Result, str | None]:
         """What came of what was executed in a slot, and why its episode cannot go on, if so."""
-        if row in executed.stuck:
-            return None, ALL_FAILED
-        outcome, world = executed.outcome, self._simulator.world
+        world = self._simulator.world
         assert world is not None
-        result = result_of(executed.choices[row], outcome, row, world, self._problem.shelf)
-        return result, overflow_trouble(outcome, row)
+        return result_of(choice, outcome, row, world, self._problem.shelf), overflow_trouble(outcome, row)
 
-    def _executed(self, choices: Mapping[int, Choice]) -> Execution:
-        """Execute what was decided in some slots; what came of it in those whose actions are over."""
-        if not (self._settings.protocol.once and isinstance(self._simulator, Flowing) and len(self._slots) > 1):
-            return self._settings.protocol.execute(self._simulator, choices)
+    def _executed(self, choices: Mapping[int, Choice]) -> tuple[Outcome, dict[int, Choice]]:
+        """Execute what was decided in some slots: the outcome in all worlds, and the choices that are over."""
+        if not (isinstance(self._simulator, Flowing) and len(self._slots) > 1):
+            outcome = jax.device_get(self._simulator.execute(*_chosen_actions(choices, len(self._slots))))
+            return outcome, dict(choices)
         if choices:
-            self._simulator.begin(*chosen_actions(choices, len(self._slots)))
+            self._simulator.begin(*_chosen_actions(choices, len(self._slots)))
         self._moving |= choices
         # As many as decide at once, and of few every second one: a decision takes less long than an action.
         done, outcome = self._simulator.advance(min(self._settings.at_once, (len(self._moving) + 1) // 2))
-        return Execution(outcome, {r: self._moving.pop(r) for r in list(self._moving) if done[r]})
+        return outcome, {r: self._moving.pop(r) for r in list(self._moving) if done[r]}
 
     def _options(self, start: Start) -> dict[str, Any]:
         """The options of an episode, as its record keeps them."""
@@ -299,6 +290,17 @@ class EpisodePool:
         seen = named_observation(slot.observation, bodies)
         tried = nothing_tried() if slot.noted is None else named_tried(slot.noted.tried(), bodies)
         return Moment(log.index, slot.snapshot, seen, slot.belief, decision, log.steps[-1], None, tried)
+
+
+def _chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, Array]:
+    """The actions of `count` worlds, by bodies' numbers, NONE without a choice, and which worlds have a choice."""
+    actions: Action = jax.tree.map(
+        lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action())
+    )
+    for row, choice in choices.items():
+        for name in Action.__dataclass_fields__:
+            getattr(actions, name)[row] = getattr(choice.executed, name)
+    return jax.device_put((actions, np.isin(np.arange(count), list(choices))))
 
 
 @kept()

@@ -32,7 +32,6 @@ class Choice(flax.struct.PyTreeNode):
       action, cost, predicted_cost: of the `Decision`.
       sequences: number of sequences that it was chosen from.
       refused: number of further sequences whose first action did harm in a trial.
-      others: the first actions of all sequences, the best first, of kind NONE after the last; None if not kept.
       bodies: the number of the body that each object stands for, shape (N,); None if objects have the bodies' numbers.
       there: whether it stands for that body, shape (N,); None if all do.
       blind: whether it sweeps space that was not measured, see `belief.sweeps_unmeasured`.
@@ -43,7 +42,6 @@ class Choice(flax.struct.PyTreeNode):
     predicted_cost: jax.Array
     sequences: jax.Array
     refused: jax.Array | int = 0
-    others: Action | None = None
     bodies: Int[np.ndarray, " objects"] | None = None
     there: Bool[np.ndarray, " objects"] | None = None
     blind: jax.Array | bool = False
@@ -65,8 +63,7 @@ class Choice(flax.struct.PyTreeNode):
 def chosen(decision: Decision) -> Choice:
     """The `Choice` of a decision."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
-    others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
-    return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused, others)
+    return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused)
 
 
 def takes_target(choice: Choice) -> bool:
@@ -246,10 +243,6 @@ class EpisodeLog:
             self._paper_graspable_step = self._index
         self.steps.append(step)
         return step
-
-    def took(self, choice: Choice) -> None:
-        """Record that another action was executed than the decided one."""
-        self.steps[-1] = dataclasses.replace(self.steps[-1], action=choice.recorded, predicted_cost=_expected(choice))
 
     def act(self, result: Result | None, trouble: str | None, timings: dict[str, float]) -> bool:
         """Record the result of the decision; returns whether the episode ends with it.

@@ -130,7 +130,7 @@ def _planner_slots(
     listeners: Listeners,
 ) -> Slots:
     """The planner's slots of the first episodes, for which the simulator is reset and everything is compiled."""
-    count, recogniser = len(first), settings.protocol.recogniser(settings.recogniser)
+    count, recogniser = len(first), settings.recogniser
     _set_cells(simulator, problem, {row: start for row, (_, start) in enumerate(first)})
     scenarios = [start.scenario for _, start in first]
     if count == 1:

@@ -18,7 +18,7 @@ from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of, truth_unseen
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
-from mechsearch_jax.envs.episode.slots import BeliefSummary, may_be_blind, sizes_and_truths, summary, swept_free_of
+from mechsearch_jax.envs.episode.slots import BeliefSummary, may_be_blind, sizes_and_truths, summary
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
@@ -248,20 +248,6 @@ class ManySlots:
         parts = np.split(results, np.cumsum(counts)[:-1])
         return [np.concatenate([part, blank[len(part) :]]).astype(np.int32) for part in parts]
 
-    def took(self, actions: Mapping[int, Action]) -> None:
-        """See `Slots`."""
-        if actions:
-            done = jax.tree.map(lambda *leaves: jnp.stack(leaves), *actions.values())
-            self._state = _note(self._state, done, jnp.array(list(actions), jnp.int32))
-
-    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
-        """See `Slots`."""
-        answers: dict[int, bool] = {}
-        for chunk, padded in self._chunks(rows):
-            free = jax.device_get(_swept_free_many(self._problem, self._state, padded))
-            answers |= dict(zip(chunk, map(bool, free), strict=False))
-        return answers
-
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """See `Slots`."""
         judged: dict[int, Verdict] = {}
@@ -391,12 +377,3 @@ def _choose(decisions: Decision, results: Int[Array, "n k"] | None, last: Bool[A
     if results is not None:
         decisions = jax.vmap(choose)(decisions, results, last)
     return jax.vmap(chosen)(decisions)
-
-
-@kept()
-def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
-    """The same in the slots `rows`; False for rows beyond the end."""
-    active = rows < state.belief.found.shape[0]
-    return jax.vmap(lambda slot_state, active: swept_free_of(problem, slot_state.observation, active))(
-        _rows_of(state, rows), active
-    )

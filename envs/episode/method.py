@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.config.fixed import AS_IN_PAPER, without_fixed
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.camera.snapshot import Recogniser
 from mechsearch_jax.envs.episode.policy_numbers import mould
-from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch
-from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
+from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.target import Target
 
 # What the options of an episode hold beside the configuration's.
-_OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
-
-# What is an option today, as it was in episodes that do not hold it.
-_FORMER = {"retrieval_max_yaw": math.radians(45)}
+_OF_EPISODES = frozenset(("policy", "recognition", AS_IN_PAPER, "simulator", "target", "seed"))
 
 # Of the paths of a mismatch's settings among the options.
 MISMATCH_PREFIX = "mismatch."
@@ -35,7 +31,7 @@ MISMATCH_PREFIX = "mismatch."
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A policy with all its settings, a recogniser, a simulator, a workcell, a protocol and a mismatch; hashable.
+    """A policy with all its settings, a recogniser, a simulator, a workcell and a mismatch; hashable.
 
     Attributes:
       name: of the policy, as `planner.policy_factory` takes it: one of `planner.POLICIES`, or the import path of
@@ -44,7 +40,6 @@ class Method:
       recognition: name of the recogniser.
       engine: name of the simulator.
       workcell: of the episodes; its target sets the resolution of candidate poses.
-      protocol: how its episodes are run and judged, one of `protocols.PROTOCOLS`.
       mismatch: how the simulated world differs from what the planner assumes.
     """
 
@@ -53,7 +48,6 @@ class Method:
     recognition: RecognitionName = "oracle"
     engine: EngineName = "NativeSimulator"
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
-    protocol: ProtocolName = "strict"
     mismatch: Mismatch = ASSUMED
 
     def policy(self) -> Policy:
@@ -66,7 +60,7 @@ class Method:
         """
         first, later = push_models(self.config.push_model, self.workcell.shelf)
         return policy_factory(self.name)(
-            self.terms.planner(self.config.planner),
+            self.config.planner,
             push_model=first,
             later_push_model=later,
             tries=self.config.rehearsal != "none",
@@ -89,16 +83,6 @@ class Method:
         """
         return recogniser(self.recognition, target, self.workcell.detector)
 
-    @property
-    def terms(self) -> EpisodeProtocol:
-        """The protocol of its episodes."""
-        return PROTOCOLS[self.protocol]
-
-    @property
-    def problem_config(self) -> ProblemConfig:
-        """The settings of its episodes' problem."""
-        return self.terms.problem(self.config.problem)
-
     def mould(self) -> Hashable:
         """A key of the programs compiled for episodes of one target.
 
@@ -108,7 +92,7 @@ class Method:
         Raises:
           InputError: as `policy`.
         """
-        shared = self.workcell, self.config.problem, self.recognition, self.engine, self.protocol
+        shared = self.workcell, self.config.problem, self.recognition, self.engine
         return *shared, self.rehearsal, self.mismatch.mould(), mould(self.policy())
 
     def check(self) -> None:
@@ -126,12 +110,13 @@ class Method:
     def options(self) -> dict[str, Any]:
         """The options that identify this method, flat and as JSON values.
 
-        They are policy, recognition, protocol, every option of the configuration by its name, and by their paths all
-        other settings that differ from the preset `standard`, the default workcell or no mismatch.
+        They are policy, recognition, whether what is no option is as in the paper, every option of the configuration by
+        its name, and by their paths all other settings that differ from the preset, `standard` or `paper`, from the
+        default workcell or from no mismatch.
         """
         named = {".".join(option.path) for option in OPTIONS}
         pairs = (
-            (self.config, PRESETS["standard"](), ""),
+            (self.config, PRESETS["paper" if self.config.planner.as_in_paper else "standard"](), ""),
             (self.workcell, Workcell(), "workcell."),
             (self.mismatch, ASSUMED, MISMATCH_PREFIX),
         )
@@ -140,26 +125,28 @@ class Method:
             usual = dict(_settings(standard, prefix))
             settings = _settings(config, prefix)
             unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
-        identity = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
+        identity = {
+            "policy": self.name,
+            "recognition": self.recognition,
+            AS_IN_PAPER: self.config.planner.as_in_paper,
+        }
         return {**identity, **self.config.options(), **unusual}
 
     @classmethod
     def of_options(cls, options: Mapping[str, Any]) -> Method:
-        """The method whose `options` these are; what they do not hold is as in the preset `standard`, or as it was
-        before it was an option. It runs natively.
+        """The method whose `options` these are; what they do not hold is as in the preset, `standard` or `paper`. It
+        runs natively.
 
         Raises:
           InputError: a setting is impossible, or an option or the path of a setting is unknown.
         """
+        options = without_fixed(options)
         option_names = {option.name for option in OPTIONS}
         unknown = [name for name in options if "." not in name and name not in option_names | _OF_EPISODES]
         if unknown:
             raise InputError(f"option {unknown[0]} is unknown to this version: what ran with it cannot be run again")
-        # An episode holds every option that there was.
-        former = _FORMER if "retrieval_tilts" in options else {}
-        config = PRESETS["standard"](
-            **former | {name: value for name, value in options.items() if name in option_names}
-        )
+        preset = PRESETS["paper" if options.get(AS_IN_PAPER) else "standard"]
+        config = preset(**{name: value for name, value in options.items() if name in option_names})
         parts: dict[str, Any] = {"config": config, "workcell": Workcell(), "mismatch": ASSUMED}
         for path, value in options.items():
             first, *rest = path.split(".")
@@ -167,8 +154,7 @@ class Method:
                 parts[first] = _with_setting(parts[first], rest, value)
             elif rest:
                 parts["config"] = _with_setting(parts["config"], path.split("."), value)
-        protocol = options.get("protocol", "strict")
-        return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
+        return cls(options["policy"], recognition=options["recognition"], **parts)
 
 
 def _settings(config: Config | Workcell | Mismatch, prefix: str) -> Iterator[tuple[str, Any]]:

@@ -22,7 +22,7 @@ from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, Truth, true_target_pose, truth_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen
-from mechsearch_jax.envs.episode.verdicts import Verdict, judge, swept_free
+from mechsearch_jax.envs.episode.verdicts import Verdict, judge
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
@@ -97,14 +97,6 @@ class Slots(Protocol):
           rows: the slots.
           last: those in which no action after this one is allowed.
         """
-        ...
-
-    def took(self, actions: Mapping[int, Action]) -> None:
-        """Set the actions of slots that execute another one than they decided."""
-        ...
-
-    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
-        """Whether in the slots `rows` the target is in sight and `verdicts.swept_free` holds."""
         ...
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -193,16 +185,6 @@ class OneSlot:
             choice = choice.replace(blind=sweeps_unmeasured(self._problem, self.belief, objects, self.action))
         return {0: jax.device_get(choice)}
 
-    def took(self, actions: Mapping[int, Action]) -> None:
-        """See `Slots`."""
-        self.action = actions.get(0, self.action)
-
-    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
-        """See `Slots`."""
-        if not rows or self.observation is None:
-            return {}
-        return {0: bool(swept_free_of(self._problem, self.observation, jnp.array(True)))}
-
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """See `Slots`."""
         return {r: judge(self._problem, self._snapshot(world)) for r in rows}
@@ -236,9 +218,3 @@ def sizes_and_truths(problem: Problem, exists: Bool[Array, "slots x"], world: Wo
     rows, columns = (jnp.arange(count)[None] for count in problem.target.grid)
     beside = (jnp.abs(rows - row[:, None]) <= 1)[:, :, None] & (jnp.abs(columns - column[:, None]) <= 1)[:, None]
     return jnp.sum(exists, axis=1), possible, jnp.any(cells & beside, axis=(1, 2))
-
-
-@kept()
-def swept_free_of(problem: Problem, seen: Observation, active: Bool[Array, ""]) -> Bool[Array, ""]:
-    """See `Slots.swept_free`; False, with little computation, if `active` is."""
-    return swept_free(problem.target_grasps, seen.objects, seen.target_pose, active & seen.target_visible)

@@ -13,9 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, transform
 from mechsearch_jax.planner import Problem, paper
 from mechsearch_jax.retrieval import (
     TargetGrasps,
@@ -23,15 +21,13 @@ from mechsearch_jax.retrieval import (
     found_grasps,
     found_hits,
     joined,
-    no_grasps,
-    straight_hits,
     target_grasps,
 )
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.session.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 
@@ -110,34 +106,6 @@ def free_in_sets(
     free = found.feasible & ~jnp.any(found_hits(grasps, found, scene, active), axis=1)
     ends = np.cumsum([len(one.tables.q7) for one in sets])[:-1]
     return [jnp.any(part) for part in jnp.split(free, ends)]
-
-
-def swept_free(
-    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, " 3"], active: Bool[Array, ""]
-) -> Bool[Array, ""]:
-    """Whether at some grasp the sweep of gripper and target, in and out on the straight approach, hits nothing.
-
-    The sweep is checked against the objects and the shelf. Neither the arm nor its reach is checked.
-
-    Args:
-      grasps: to choose from.
-      scene: the objects, without the target.
-      pose: of the target as x, y [m], yaw [rad].
-      active: if False, the result is False, and little is computed.
-    """
-    tables, shelf = grasps.tables, grasps.shelf
-    T_world_target = grasps.standing(pose)
-    T_world_gripper = compose(T_world_target[None], tables.T_target_gripper)
-
-    def touches(shelf, _, row):
-        T, cloud = row
-        return jnp.any(hits_shelf(shelf, transform(T, cloud.T)))
-
-    wanted = jnp.broadcast_to(active, tables.q7.shape)
-    free = wanted & ~masked_vmap(touches, wanted, shelf, None, (T_world_gripper, tables.clouds))
-    at_target = no_grasps(grasps).replace(T_world_target=T_world_target, feasible=free)
-    hits = straight_hits(tables, at_target, scene, active)
-    return jnp.any(free & ~jnp.any(hits, axis=1))
 
 
 @kept()

@@ -111,8 +111,8 @@ class NativePhysics:
     """The `PushModel` that simulates pushes in C MuJoCo; a batch under `vmap` runs at once, on several threads.
 
     `jax.pure_callback` hands a batch to the host in one call. A plan makes one call for the first draws of all
-    sequences, and one for each further draw of the sequences without a possible action: at most
-    `PlannerConfig.first_draws` calls, or `draws` if that is more. The same pushes always give the same results. The
+    sequences, and one for each further draw of the sequences without a possible action: at most as many calls as
+    `PlannerConfig.draws` says. The same pushes always give the same results. The
     residual is infinite if the simulation diverges, the arm cannot follow the push, or the scene is invalid.
 
     Attributes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.actions import KINDS, Action, kind_of
+from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.episode_log import target_trouble
-from mechsearch_jax.envs.episode.protocols import REACHED
-from mechsearch_jax.envs.episode.records import ActionRecord, Step
+from mechsearch_jax.envs.episode.records import Step
 from mechsearch_jax.envs.known_target.in_the_way import blocking, least_sets, objects_in_words
 from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
@@ -116,7 +115,6 @@ class StepValues:
     Attributes:
       number: of the step, from 1.
       heading: the decided action in words.
-      executed: the executed action, where that is another one.
       found: whether the target is found.
       poses: number of poses in f; 1 once something is taken for the target.
       every: number of candidate poses.
@@ -139,7 +137,6 @@ class StepValues:
 
     number: int
     heading: str
-    executed: str
     found: bool
     poses: int
     every: int
@@ -181,8 +178,6 @@ def ending(recording: Recording) -> Ending:
         return Ending(None, how, "")
     if episode.retrieved:
         return Ending(True, "Retrieved", how)
-    if episode.failure == REACHED:
-        return Ending(True, "Graspable", how)
     return Ending(False, f"Lost: {_plain(episode.failure or 'not retrieved')}", how)
 
 
@@ -199,7 +194,6 @@ def step_values(recording: Recording, i: int) -> StepValues:
     return StepValues(
         number=i + 1,
         heading="no action" if step.action is None else _in_words(step.action, step),
-        executed=_executed(step, record),
         found=step.found,
         poses=size,
         every=len(step.existence),
@@ -271,19 +265,6 @@ def _same(action: Action, other: Action) -> bool:
     return int(action.kind) == int(other.kind) and all(
         np.allclose(getattr(action, name), getattr(other, name), atol=1e-6) for name in names
     )
-
-
-def _executed(step: RecordedStep, record: Step | None) -> str:
-    """The executed action in words, where it is not the decided one: the published code's protocol may replace it."""
-    if record is None or record.action is None or step.action is None:
-        return ""
-    codes = {kind.name: kind.code for kind in KINDS.values()}
-    given: dict[str, Any] = {
-        f.name: np.asarray(getattr(record.action, f.name)) for f in dataclasses.fields(ActionRecord)[2:]
-    }
-    moves = -1 if record.action.object is None else record.action.object
-    executed = Action(kind=np.int32(codes[record.action.kind]), object=np.int32(moves), **given)  # pyright: ignore[reportArgumentType]
-    return "" if _same(step.action, executed) else _in_words(executed, step)
 
 
 def _candidates(step: RecordedStep) -> tuple[Candidate, ...]:

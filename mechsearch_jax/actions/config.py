@@ -54,8 +54,8 @@ class ActionConfig:
       clearance: distance to neighbours when placing [m].
       contact_tolerance: depth of contact with other objects that is allowed on a picked object's way out [m]: touching
         objects are often recognised as overlapping, and would lock each other in.
-      avoid_unseen: whether candidates that enter space where the target may be are sampled only if their object has no
-        others; the paper does not test this.
+      as_in_paper: set by preset `paper` alone. If False, candidates that enter space where the target may be are
+        sampled only if their object has no others; the paper does not test this.
       cloud_points: points on the swept gripper.
       still_points: points on the gripper at rest.
       pusher_points: points on the hand and fingers.
@@ -85,9 +85,7 @@ class ActionConfig:
     place_yaw: float = math.radians(30)
     clearance: float = 0.005
     contact_tolerance: float = 0.003
-    avoid_unseen: bool = option(
-        True, "whether actions that enter space where the target may be come last; the paper's do not"
-    )
+    as_in_paper: bool = False
     cloud_points: int = 1024
     still_points: int = 512
     pusher_points: int = 384

@@ -125,7 +125,7 @@ def update_belief(
     # A lost target may be at any candidate pose: f was not updated while it counted as found.
     prior = belief.exists | lost
     exists = prior
-    if before is not None and action is not None and settings.reopen:
+    if before is not None and action is not None and not settings.as_in_paper:
         exists |= reopened(problem, exists, before.with_boxes().objects, objects, action)
     both = exists & now
     found = (belief.found & ~lost) | visible

@@ -31,8 +31,7 @@ def evaluate(
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       out: folder for the results, one row for each episode; those of which it holds a row are not run again.
       method: one or more; search-for-grasp by default.
-      policy: instead of methods, names of policies (also random, greedy, most-occluding, mctx), or import paths of
-        others, one or more.
+      policy: instead of methods, names of policies (also random, greedy), or import paths of others, one or more.
       seed: one or more.
       run: how the episodes are run.
       options: how the planner decides.

@@ -26,7 +26,7 @@ from mechsearch_jax.commands.cell.calibrate import calibrate
 from mechsearch_jax.commands.cell.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
-from mechsearch_jax.commands.options import EpisodeOptions, with_planner_options
+from mechsearch_jax.commands.options import EpisodeOptions, in_boxes, out_of_boxes, with_planner_options
 from mechsearch_jax.commands.plan import plan
 from mechsearch_jax.commands.recordings import video, view
 from mechsearch_jax.commands.report import report
@@ -34,6 +34,7 @@ from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.study import study
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
+from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, Note, nearest
 from mechsearch_jax.runtime.own_settings import OWN
 
@@ -93,8 +94,12 @@ def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]
     parameters = dict(signature.parameters)
     if "options" in hints:
         options = _OPTIONS[hints["options"]]()
-        hints["options"] = Annotated[options, tyro.conf.arg(name="")]
-        parameters["options"] = parameters["options"].replace(default=options())
+        boxes = in_boxes(options)
+        parsed = lambda *args, **kwargs: functools.partial(  # noqa: E731
+            command, *args, **kwargs | {"options": out_of_boxes(options, kwargs["options"])}
+        )
+        hints["options"] = Annotated[boxes, tyro.conf.arg(name="")]
+        parameters["options"] = parameters["options"].replace(default=boxes())
     for name, parameter in parameters.items():
         # The help of such an option describes its default.
         given_by_place = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
@@ -154,6 +159,8 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     except SystemExit as end:
         if not end.code:
             raise
+        for fixed in filter(None, map(refusal, (part for part in rest if part.startswith("--")))):
+            raise InputError(fixed) from None
         helpful = f"{program} {name}" if name in commands else program
         raise InputError(f"{one_line(complaint.getvalue())} ({helpful} --help tells more)") from None
     return command

@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -38,13 +38,11 @@ class EpisodeOptions:
         target's too; the others see noisy depth, "masks" with true segments; "-parts": bodies of up to four parts.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
-      protocol: how episodes are run and judged: strictly, or as the authors' published code does.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
-    protocol: Literal["strict", "published-code"] = "strict"
 
     def settings(self) -> Settings:
         """The configuration file's settings, overridden by the options that are given.
@@ -82,8 +80,7 @@ class EpisodeOptions:
             sys.path.append("")
         settings, mismatch = self.settings(), self.mismatch()
         methods = [
-            Method(name, settings.config, self.recognition, engine, settings.workcell, self.protocol, mismatch)
-            for name in policies
+            Method(name, settings.config, self.recognition, engine, settings.workcell, mismatch) for name in policies
         ]
         for method in methods:
             method.check()
@@ -159,6 +156,54 @@ def with_planner_options() -> type[EpisodeOptions]:
     return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
 
 
+# Boxes of the help, by the names of their first words, with what they are about. Planner options are all the others.
+BOXES = {
+    "search": "Where settings come from, and how a search is run.",
+    "recognition": "What the planner sees the objects through.",
+    "planner": "How the next action is chosen.",
+    "world": "How the simulated world differs from what the planner assumes.",
+}
+_SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "rehearsal", "max_steps")
+_RECOGNITION = (
+    *("recognition", "depth_noise", "missing_depth", "holes"),
+    *("color_noise", "exposure", "white_balance", "hue_gap"),
+)
+
+
+def _box(name: str) -> str:
+    """The box of an option."""
+    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
+
+    if name in _RECOGNITION:
+        return "recognition"
+    if name in _SEARCH:
+        return "search"
+    return "world" if name in {option.name for option in MISMATCH_OPTIONS} else "planner"
+
+
+@functools.cache
+def in_boxes(options: type) -> type:
+    """A type with the fields of a type of options in a part for each of `BOXES`; for the parser alone."""
+    described = next(kind.__doc__ or "" for kind in options.__mro__ if "Attributes:" in (kind.__doc__ or ""))
+    hints = get_type_hints(options, include_extras=True)
+    parts: list[tuple[str, Any, Any]] = []
+    for box, about in BOXES.items():
+        fields = [
+            (field.name, hints[field.name], field.default)
+            for field in dataclasses.fields(options)
+            if _box(field.name) == box
+        ]
+        part = dataclasses.make_dataclass(box.capitalize(), fields, frozen=True, kw_only=True)
+        part.__doc__ = f"{about}\n\n    Attributes:{described.partition('Attributes:')[2]}"
+        parts.append((box, Annotated[part, tyro.conf.OmitArgPrefixes], dataclasses.field(default_factory=part)))
+    return dataclasses.make_dataclass("Boxes", parts, frozen=True, kw_only=True)
+
+
+def out_of_boxes(options: type, boxes: Any) -> Any:
+    """The options of an instance of `in_boxes(options)`."""
+    return options(**{name: value for box in BOXES for name, value in vars(getattr(boxes, box)).items()})
+
+
 def _annotation(option: Option, hint: str) -> Any:
     """The type of a command line's option that may be left out."""
     kind = Literal[option.choices] if option.choices else option.type
@@ -232,8 +277,7 @@ class OnePolicy:
 
     Attributes:
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
-      policy: instead of a method, the name of a policy (also random, greedy, most-occluding, mctx), or the import path
-        of another.
+      policy: instead of a method, the name of a policy (also random, greedy), or the import path of another.
     """
 
     method: Annotated[

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 TableName = Literal["table1", "table3", "table4", "table5"]
 Recognition = Literal["oracle", "masks", "full", "informed"]
-ProtocolName = Literal["strict", "published-code"]
 
 
 def _several(metavar: str) -> Any:
@@ -45,7 +44,6 @@ class Cells:
       recognition: what the planner sees: true shapes, a noisy depth image with true masks (the paper's R), or the image
         alone, these three by default; or true shapes and the hidden target.
       preset: where the planner's settings come from, one or more; paper and standard by default.
-      protocol: how episodes are run and judged, one or both; strict by default.
       retrieval_contact: whether the target may be taken out with a grasp that brushes something, where it is tried out
         first; only False is the paper's grasp. True by default; both for either.
       objects: only the scenes with so many.
@@ -57,7 +55,6 @@ class Cells:
     method: Annotated[tuple[PaperMethod, ...], _several("{search-and-grasp,search-for-grasp}")] = ()
     recognition: Annotated[tuple[Recognition, ...], _several("{oracle,masks,full,informed}")] = ()
     preset: Annotated[tuple[str, ...], _several("NAME")] = ()
-    protocol: Annotated[tuple[ProtocolName, ...], _several("{strict,published-code}")] = ()
     retrieval_contact: Annotated[tuple[bool, ...], _several("{True,False}")] = ()
     objects: Annotated[tuple[int, ...], _several("N")] = ()
     scenes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
@@ -98,13 +95,12 @@ class Cells:
         grasps = [ANY if contact else COLLISION_FREE for contact in self.retrieval_contact or (True,)]
         product = itertools.product(
             self.preset or ("paper", "standard"),
-            self.protocol or ("strict",),
             grasps,
             self.recognition or ("oracle", "masks", "full"),
             self.method or METHODS,
             table.actions,
         )
-        return [Setting(m, r, actions, p, terms, g) for p, terms, g, r, m, actions in dict.fromkeys(product)]
+        return [Setting(m, r, actions, p, g) for p, g, r, m, actions in dict.fromkeys(product)]
 
 
 # The default.
@@ -125,7 +121,6 @@ def _methods(settings: Sequence[Setting], simulator: str, engine: EngineName) ->
         point = options(
             preset=setting.preset,
             recognition=setting.recognition,
-            protocol=setting.protocol,
             actions=setting.actions,
             simulator=simulator,
             **({CONTACT: False} if setting.grasps == COLLISION_FREE else {}),

@@ -145,7 +145,6 @@ def _run(
         recogniser=chosen.recogniser(problem.target),
         max_steps=chosen.config.max_steps,
         options=chosen.options(),
-        protocol=chosen.terms,
         trials=chosen.trials(),
     )
     start = Start(scene, seed, mismatch=chosen.mismatch)
@@ -214,7 +213,7 @@ def search(
             console.print(
                 f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
             )
-            problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
+            problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.config.problem)
             episode, narrator, recorder = _run(status, preparing, chosen, scene, problem, seed, keeps.records)
         # Imported late: they take long.
         from mechsearch_jax.envs.recording.narration import verdict

@@ -40,9 +40,8 @@ def study(
 
     Args:
       names: of studies: gamma, horizon, sequences, actions, extensions, push-model, steps, recognition,
-        friction-learned, images, confirmation, extensions-full, one-ahead, first-actions, baselines, friction,
-        friction-without-trials, mass, friction-and-mass, calibration, sensor, cameras, shelf-low, shelf-narrow,
-        shelf-wide, physics; or all.
+        friction-learned, images, first-actions, baselines, friction, friction-without-trials, mass, friction-and-mass,
+        calibration, sensor, cameras, shelf-low, shelf-narrow, shelf-wide, physics; or all.
       out: folder for the results, one row for each episode.
       scenes: only the first so many of each number of objects, for a quick look.
       seed: one or more.

@@ -19,26 +19,25 @@ from mechsearch_jax.commands.options import (
     with_planner_options,
 )
 from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_episodes_of
+from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from mechsearch_jax.planner import Option
 
 Recognition = Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"]
-ProtocolName = Literal["strict", "published-code"]
 SimulatorName = Literal["auto", "native", "mjx"]
 # Types of the keys of a sweep's file that are no options of the planner; all but the last two may be lists.
 _KEYS: Mapping[str, Any] = {
     **dict.fromkeys(("scenarios", "policy", "method"), str),
     "seed": int,
     "recognition": Recognition,
-    "protocol": ProtocolName,
     "simulator": SimulatorName,
     "config": str,
 }
 _SINGLE = ("simulator", "config")
 # Keys that are fields of `SweptOptions`, and the names of the fields.
-_FIELDS = {"recognition": "recognition", "protocol": "protocol", "simulator": "simulator", "config": "config_file"}
+_FIELDS = {"recognition": "recognition", "simulator": "simulator", "config": "config_file"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,6 @@ class SweptOptions:
         before it. One for all.
       recognition: "oracle" knows true shapes and poses, "informed" also the hidden target's; the others see a noisy
         depth image, "masks" with the true segmentation, "full" without.
-      protocol: how episodes are run and judged: strictly, or as the authors' published code does.
       simulator: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for batches where there is a GPU.
         One for all.
     """
@@ -59,10 +57,6 @@ class SweptOptions:
     recognition: Annotated[
         tuple[Recognition, ...],
         tyro.conf.arg(metavar="{oracle,masks,full,informed} ...", help_behavior_hint="(default: oracle)"),
-    ] = ()
-    protocol: Annotated[
-        tuple[ProtocolName, ...],
-        tyro.conf.arg(metavar="{strict,published-code} ...", help_behavior_hint="(default: strict)"),
     ] = ()
     simulator: Annotated[
         SimulatorName | None, tyro.conf.arg(metavar="{auto,native,mjx}", help_behavior_hint="(default: auto)")
@@ -78,8 +72,7 @@ class SweptOptions:
 
         kind: Any = with_planner_options()
         lists = {option.name: option.type for option in OPTIONS if get_origin(option.type) is tuple}
-        listed = {"recognition": self.recognition, "protocol": self.protocol}
-        swept = {**listed, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
+        swept = {"recognition": self.recognition, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
         given = {
             name: [_listed(name, value, lists[name]) if name in lists else value for value in values]
             for name, values in swept.items()
@@ -191,7 +184,8 @@ def read_sweep(path: Path) -> dict[str, Any]:
     for key, value in document.tables[""].items():
         where = document.where("", key)
         if key not in key_types:
-            raise InputError(f"{where} is unknown; {nearest(key, key_types)}")
+            fixed = refusal(key)
+            raise InputError(f"{where}: {fixed}" if fixed else f"{where} is unknown; {nearest(key, key_types)}")
         if key in _SINGLE:
             values_of[key] = checked(value, key_types[key], where)
             continue
@@ -215,8 +209,8 @@ def sweep(
 ) -> None:
     """Run many episodes with all combinations of several values of any option; otherwise as evaluate.
 
-    The rows are those of evaluate, in the same kind of folder. Settings that are continuous (gamma, charges, guidance)
-    share one compilation, and in batches one batch.
+    The rows are those of evaluate, in the same kind of folder. Values of gamma share one compilation, in batches one
+    batch.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.

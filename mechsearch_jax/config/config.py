@@ -15,14 +15,13 @@ import jax
 from jaxtyping import Array
 
 from mechsearch_jax.actions.config import ActionConfig
-from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
+from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 
-Imitated = Literal["nothing", "published-code"]
 RehearsalName = Literal["none", "physics", "learning"]
 
 
@@ -47,13 +46,9 @@ class Weights(NamedTuple):
     meta_fields=(
         "horizon",
         "sequences",
-        "draws",
-        "first_draws",
-        "move_again",
         "move_target",
         "retrieval_contact",
-        "predicted_collisions",
-        "imitates",
+        "as_in_paper",
     ),
 )
 @dataclasses.dataclass(frozen=True)
@@ -71,43 +66,35 @@ class PlannerConfig:
         other draws are uniform, as all are in the paper.
       crowding_weight: weight in J of objects that only some of a pose's grasps hit; the paper's J counts the best grasp
         of a pose alone. Small enough that no number of hits outweighs one object of the cost proper.
-      draws: how often an action is drawn until one is possible; static. The paper has no limit.
-      first_draws: the same for the first action of a sequence, if that is more; static. A first action is executed, so
-        it is worth more draws.
-      move_again: whether an object may move more than once in a sequence, as in the paper; static.
       move_target: whether a found target may be pushed, too; static. Nothing else helps if every grasp of it hits an
         object that can neither be grasped nor pushed, but that is too rare to gain anything.
       retrieval_contact: whether a grasp that hits objects may take a found target out if its trial succeeds; static.
         Not so in the paper. If False, only grasps that hit nothing are tried.
-      predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
-        too, as in the paper; static. If False, poses that an object is moved to stay possible: a target there would be
-        pushed along.
-      imitates: whose peculiarities the slots of a policy have, one of `imitation.IMITATIONS`; static.
+      as_in_paper: set by preset `paper` alone; static. An object may then move more than once in a sequence, an action
+        is drawn more often until one is possible, and f rules out overlaps of the target with objects (equation 14) in
+        predicted states, too. If False, poses that an object is moved to stay possible: a target there would be pushed
+        along.
     """
 
     gamma: float = option(0.9, "discount of later actions, above 0 and at most 1")
     horizon: int = option(1, "actions in a sequence; the paper's is 3")
     sequences: int = option(100, "sequences that are sampled for a decision; the paper's is 30")
-    unseen_contact_penalty: float = option(
-        1.0, "what an action costs that may touch the unseen target, as a share of J; the paper's is 0"
-    )
-    guided_fraction: float = option(
-        0.7, "share of the sampled actions that go to objects by how much they hide or block; the paper's is 0"
-    )
-    crowding_weight: float = option(
-        0.02, "how much J minds objects that only some grasps of a pose hit; the paper's is 0"
-    )
-    draws: int = option(1, "how often an action is drawn until one is possible")
-    first_draws: int = option(4, "the same for the first action of a sequence, where that is more")
-    move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
+    unseen_contact_penalty: float = 1.0
+    guided_fraction: float = 0.7
+    crowding_weight: float = 0.02
     move_target: bool = option(False, "whether a found target may be pushed, too, as it may not in the paper")
     retrieval_contact: bool = option(
         True, "whether trials may take a found target out with a grasp that touches objects; not in the paper"
     )
-    predicted_collisions: bool = option(
-        False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
-    )
-    imitates: Imitated = option("nothing", "whose code is imitated where no option applies", get_args(Imitated))
+    as_in_paper: bool = False
+
+    @property
+    def draws(self) -> tuple[int, int]:
+        """How often an action is drawn until one is possible: the first of a sequence, and a later one.
+
+        A first action is executed, so it is worth more draws. The paper has no limit: 8 is an approximation.
+        """
+        return (8, 8) if self.as_in_paper else (4, 1)
 
     @property
     def weights(self) -> Weights:
@@ -126,9 +113,7 @@ class PlannerConfig:
             raise InputError(
                 f"guided_fraction {self.guided_fraction} is outside [0, 1); the default is 0.7, and 0 draws evenly"
             )
-        if self.imitates not in get_args(Imitated):
-            raise InputError(f'imitates "{self.imitates}" is unknown; use {", ".join(get_args(Imitated))}')
-        for name in ("horizon", "sequences", "draws", "first_draws"):
+        for name in ("horizon", "sequences"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
 
@@ -198,7 +183,7 @@ class Config:
         paths = {option.name: option.path for option in OPTIONS}
         for name, value in changes.items():
             if name not in paths:
-                raise InputError(f"option {name} is unknown; there are {', '.join(paths)}")
+                raise InputError(refusal(name) or f"option {name} is unknown; there are {', '.join(paths)}")
             config = _with(config, paths[name], tuple(value) if isinstance(value, list) else value)
         return config
 
@@ -233,12 +218,12 @@ def _with(value: Any, path: tuple[str, ...], new: Any) -> Any:
     return dataclasses.replace(value, **{path[0]: inner})
 
 
-def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option, ...]:
+def _fields(kind: type, path: tuple[str, ...]) -> tuple[Option, ...]:
     """The options among the fields of a configuration class, in their order."""
     hints = get_type_hints(kind)
     return tuple(
         Option(
-            prefix + field.name,
+            field.name,
             (*path, field.name),
             str if field.metadata["choices"] else hints[field.name],
             field.metadata["help"],
@@ -252,9 +237,5 @@ def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option
 OPTIONS: tuple[Option, ...] = (
     *_fields(PlannerConfig, ("planner",)),
     *_fields(ActionConfig, ("problem", "actions")),
-    *_fields(ObjectGraspConfig, ("problem", "actions", "grasps"), "object_grasp_"),
-    *_fields(ExistenceConfig, ("problem", "existence")),
-    *_fields(GraspConfig, ("problem", "grasps"), "grasp_"),
-    *_fields(GraspConfig, ("problem", "retrieval"), "retrieval_"),
     *_fields(Config, ()),
 )

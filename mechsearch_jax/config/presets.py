@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mechsearch_jax.config.config import Config
+from mechsearch_jax.actions.config import ActionConfig
+from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
+from mechsearch_jax.config.config import Config, PlannerConfig, ProblemConfig
+from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
-
-# Draws of an action in preset `paper` until one is possible: an approximation, since the paper's have no limit.
-REDRAWS = 8
 
 
 def standard(**changes: Any) -> Config:
@@ -33,72 +35,34 @@ def paper(**changes: Any) -> Config:
     Args:
       **changes: options by name, see `Config.with_options`.
     """
-    tilt = (math.radians(20),)
+    tilts, max_yaw = (math.radians(20),), math.radians(45)
+    problem = ProblemConfig(
+        existence=ExistenceConfig(as_in_paper=True),
+        grasps=GraspConfig(tilts=tilts),
+        retrieval=dataclasses.replace(GraspConfig.dense(), tilts=tilts, max_yaw=max_yaw),
+        actions=ActionConfig(as_in_paper=True, grasps=ObjectGraspConfig(tilts=tilts, max_yaw=max_yaw)),
+    )
+    planner = PlannerConfig(as_in_paper=True, unseen_contact_penalty=0.0, guided_fraction=0.0, crowding_weight=0.0)
     settings = {
-        "criterion": "depth-mse",
-        "cell_reach": (0.5,),
-        "closer_look": 0,
-        "erosion": 0.0,
-        "reopen": False,
-        "predicted_collisions": True,
-        "grasp_tilts": tilt,
-        "retrieval_tilts": tilt,
-        "retrieval_max_yaw": math.radians(45),
-        "object_grasp_tilts": tilt,
-        "object_grasp_max_yaw": math.radians(45),
         "push_directions": (math.radians(90), math.radians(-90)),
         "push_distances": (0.05, 0.10, 0.15),
         "actions": ("push", "pick-and-place"),
-        "avoid_unseen": False,
-        "guided_fraction": 0.0,
-        "unseen_contact_penalty": 0.0,
-        "crowding_weight": 0.0,
-        "draws": REDRAWS,
-        "first_draws": 1,
-        "move_again": True,
         "move_target": False,
         "rehearsal": "none",
         "horizon": 3,
         "sequences": 30,
     }
-    return Config().with_options(**settings | changes)
-
-
-def best(**changes: Any) -> Config:
-    """The highest success rate, for users with a GPU or time: `standard` with 20 actions and up to 4 draws of each.
-
-    Args:
-      **changes: options by name, see `Config.with_options`.
-    """
-    return standard(**{"draws": 4, "max_steps": 20} | changes)
-
-
-def published_code(**changes: Any) -> Config:
-    """`paper` with the peculiarities of the code that the method's authors published.
-
-    Pushes go 10 cm; later actions of a sequence are drawn in the present scene, not the predicted one; later
-    pick-and-places are predicted to move nothing; objects in the way of a grasp count a tenth in J.
-
-    Args:
-      **changes: options by name, see `Config.with_options`.
-    """
-    settings = {
-        "push_distances": (0.10,),
-        "imitates": "published-code",
-    }
-    return paper(**settings | changes)
+    return Config(problem, planner).with_options(**settings | changes)
 
 
 PRESETS: Mapping[str, Callable[..., Config]] = {
     "standard": standard,
     "paper": paper,
-    "best": best,
-    "published-code": published_code,
 }
 DEFAULT_PRESET = "standard"
 
 # The options that define the possible actions, not how they are chosen.
-ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts", "object_grasp_max_yaw")
+ACTION_OPTIONS = ("actions", "push_directions", "push_distances")
 
 
 def action_set(name: str) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def allowances(
         )
         strip = jnp.where(2 * shown <= whole, shown - apart, 0)
         bound = jnp.floor(unseen / seen).astype(jnp.int32) + strip
-    if config.criterion != "detector" or not config.closer_look:
+    if not config.looks_closer:
         return bound
     is_free = free(views, everywhere)
     settled = jnp.any(is_free & (shown <= bound), axis=1)

@@ -17,7 +17,7 @@ from mechsearch_jax.images.measured import unmeasured, veiled
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 
-# Depth of the background in "depth-mse" [m].
+# Depth of the background where depth images are compared [m].
 FAR = 1.5
 
 
@@ -62,9 +62,9 @@ def undetected(
     """At which places of the poses where `exists` the target would not be detected; arguments as of `existence`."""
     coarse = camera.scaled(config.step(camera))
     image = veiled(render.merge_windows(coarse, views.windows), measured)
-    if config.criterion == "detector":
-        return shown_pixels(tables, coarse, image, exists) <= allowed
-    return _alike(tables, coarse, image, exists, config)
+    if config.as_in_paper:
+        return _alike(tables, coarse, image, exists, config)
+    return shown_pixels(tables, coarse, image, exists) <= allowed
 
 
 def free(views: ObjectViews, exists: Bool[Array, " x"]) -> Bool[Array, "x #s"]:

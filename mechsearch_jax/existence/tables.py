@@ -34,7 +34,7 @@ class ExistenceTables(flax.struct.PyTreeNode):
       corner: first row and column of that window in the coarse image, shape (X, S, 2).
       middle: row and column of the pixel in the middle of the target's image at the first place, shape (X, 2).
       nearest: the least depth of the target at the first place, shape (X,) [m].
-      cloud: surface of the shrunk target in its own frame as rows of coordinates, shape (3, P) [m].
+      cloud: surface of the target in its own frame as rows of coordinates, shape (3, P) [m].
       radius: radius of a sphere that contains the target [m].
     """
 
@@ -58,7 +58,7 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     views, first = (_views_of_pieces if target.is_compound else _views)(coarse, target, T, window, around)
     depth, corner, first = jax.device_get((views.depth, views.corner, first))
     middle = first[:, 0] + np.array(around, np.int32)[None] // 2
-    cloud = surface_cloud(target, config.points, config.erosion)
+    cloud = surface_cloud(target, config.points)
     nearest = depth[:, 0].min(axis=(-1, -2))
     radius = np.float32(np.linalg.norm(half))
     return ExistenceTables(*jax.device_put((T, depth, corner, middle, nearest, cloud.T, radius)))

@@ -60,16 +60,14 @@ class SearchForGrasp:
     """Where the target can be and how far it is from graspable there, together (the sum of f * (2 - g)).
 
     Attributes:
-      hindrance: weight of the objects that a grasp hits: the factor of f (1 - g) in equation 2.
       reached: see `Objective`.
     """
 
-    hindrance: float = 1.0
     reached: float = 1.0
 
     def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
         f, hindered, crowded = _where_and_how_graspable(problem, belief, state)
-        return jnp.sum(f * (1.0 + self.hindrance * hindered + weights.crowding * crowded))
+        return jnp.sum(f * (1.0 + hindered + weights.crowding * crowded))
 
     def needs_graspability(self, belief, state) -> Bool[Array, " y"]:
         return possible_poses(belief, state.exists, state.target_at)
@@ -80,16 +78,14 @@ class SearchAndGrasp:
     """First where the target can be; once it is found, how far it is from graspable.
 
     Attributes:
-      hindrance: see `SearchForGrasp`.
       reached: see `Objective`.
     """
 
-    hindrance: float = 1.0
     reached: float = 0.0
 
     def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
         f, hindered, crowded = _where_and_how_graspable(problem, belief, state)
-        grasp_cost = self.hindrance * hindered + weights.crowding * crowded
+        grasp_cost = hindered + weights.crowding * crowded
         return jnp.where(belief.found, jnp.sum(f * grasp_cost), jnp.sum(f))
 
     def needs_graspability(self, belief, state) -> Bool[Array, " y"]:

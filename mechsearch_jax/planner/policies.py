@@ -27,11 +27,9 @@ from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
-from mechsearch_jax.planner.occlusion import draw_by_occlusion, plan_by_occlusion
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
-from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted, guided_draw
+from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
@@ -96,7 +94,7 @@ class PlanningPolicy(flax.struct.PyTreeNode):
 
     Attributes:
       config: settings of the planner.
-      propose, predict, objective, drawn_in: the slots; static.
+      propose, predict, objective: the slots; static.
       plan: plans with the slots; static.
       tries: whether decisions hold alternatives for trials; static. The action does not depend on it: a grasp must hit
         nothing. But `cost` and `sequences` are then those of the plan, for where no grasp succeeds in its trial.
@@ -107,13 +105,12 @@ class PlanningPolicy(flax.struct.PyTreeNode):
     propose: Propose = flax.struct.field(pytree_node=False)
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
-    drawn_in: DrawnIn = flax.struct.field(pytree_node=False, default=as_predicted)
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
     tries: bool = flax.struct.field(pytree_node=False, default=False)
 
     def rollout(self, problem: Problem, belief: Belief) -> Rollout:
         """The engine with this policy's slots."""
-        return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective, self.drawn_in)
+        return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective)
 
     @property
     def grasps(self) -> Kept:
@@ -275,8 +272,8 @@ def planning_policy(
     """
     push_model = push_model or own_push_model("learned")
     config = dataclasses.replace(_planner_config(config), **changes)
-    slots = Slots(propose, PredictByKind(push_model, later_push_model or push_model), objective)
-    return PlanningPolicy(config=config, tries=tries, **IMITATIONS[config.imitates](slots)._asdict())
+    predict = PredictByKind(push_model, later_push_model or push_model)
+    return PlanningPolicy(config, propose, predict, objective, tries=tries)
 
 
 # Minimises f and g together while it searches (equation 2).
@@ -320,46 +317,11 @@ def greedy(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
     return search_and_grasp(plain, **slots)
 
 
-def most_occluding(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
-    """A baseline: moves the object that hides the most possible poses, by any action; see `occlusion`.
-
-    Once the target is found: the object that the most of its grasps hit.
-
-    If no action of the object is possible, the next one in that order is moved. It does not plan ahead and does not
-    move a found target: of `config`, the horizon, `move_target`, the guided fraction, the crowding weight and all
-    penalties are ignored.
-    """
-    plain = dataclasses.replace(
-        _planner_config(config),
-        horizon=1,
-        move_target=False,
-        guided_fraction=0.0,
-        crowding_weight=0.0,
-        unseen_contact_penalty=0.0,
-    )
-    return search_and_grasp(plain, propose=draw_by_occlusion, **slots).replace(plan=plan_by_occlusion)
-
-
-def mctx(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
-    """A baseline: Monte-Carlo tree search with the library `mctx` on the cost of `search_for_grasp`; see `tree_search`.
-
-    Raises:
-      InputError: `mctx` is not installed.
-    """
-    # An optional dependency that takes time to import.
-    from mechsearch_jax.planner.tree_search import import_mctx, tree_plan
-
-    import_mctx()
-    return search_for_grasp(config, **slots).replace(plan=tree_plan)
-
-
 POLICIES: Mapping[str, PolicyFactory] = {
     "search-for-grasp": search_for_grasp,
     "search-and-grasp": search_and_grasp,
     "random": random_action,
     "greedy": greedy,
-    "most-occluding": most_occluding,
-    "mctx": mctx,
 }
 
 

@@ -13,7 +13,6 @@ from mechsearch_jax.actions.sampler import sample_action
 from mechsearch_jax.actions.types import Sample
 from mechsearch_jax.belief.belief import Belief, possible_space
 from mechsearch_jax.existence import occluders
-from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import pairs
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.state import State
@@ -91,24 +90,6 @@ class WeightedDraw:
             state.able,
             self.weigh(problem, belief, objective, guided_fraction, state),
         )
-
-
-class DrawnIn(Protocol):
-    """Chooses the state in which actions are drawn; static under jit."""
-
-    def __call__(self, present: Superquadrics | None, state: State) -> State:
-        """The state in which to draw an action that is executed in `state`.
-
-        Args:
-          present: the scene in which all sequences begin, fields (N, ...); None outside of sequences.
-          state: the predicted state.
-        """
-        ...
-
-
-def as_predicted(present: Superquadrics | None, state: State) -> State:
-    """The default `DrawnIn`: an action is drawn in the predicted state before it, as in the paper."""
-    return state
 
 
 def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Array, " n"]:

@@ -29,7 +29,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
-from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
+from mechsearch_jax.planner.proposal import Propose
 from mechsearch_jax.planner.state import Decision, Sequences, State
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import found_hits
@@ -77,7 +77,7 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
     """
     scene, is_target = with_target(problem, belief, objects)
     count, spread = problem.existence.T_world_target.shape[:2]
-    places = (count, spread) if config.predicted_collisions else None
+    places = (count, spread) if config.as_in_paper else None
     return State(
         scene=scene,
         is_target=is_target,
@@ -100,8 +100,7 @@ class Rollout:
     Attributes:
       problem, belief: constants of the search, and the present belief.
       config: settings of the planner.
-      propose, predict, objective, drawn_in: the slots.
-      present: the scene in which sequences begin; None outside of sequences.
+      propose, predict, objective: the slots.
     """
 
     problem: Problem
@@ -110,8 +109,6 @@ class Rollout:
     propose: Propose
     predict: Predict
     objective: Objective
-    drawn_in: DrawnIn = as_predicted
-    present: Superquadrics | None = None
 
     def root(self, objects: Superquadrics) -> State:
         """`present_state` of the rollout's problem and belief."""
@@ -125,7 +122,7 @@ class Rollout:
             # Only the found pose counts; see `belief.without_candidates`.
             counts = self.objective.needs_graspability(self.belief, state)[-1]
             return state.replace(hits=found_hits(problem.target_grasps, grasps, objects, counts, state.hits, moved))
-        counts_collisions = state.exists if self.config.predicted_collisions else None
+        counts_collisions = state.exists if self.config.as_in_paper else None
         views = object_views(
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
         )
@@ -143,10 +140,9 @@ class Rollout:
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, hits_at_found]))
 
     def candidates(self, state: State, moved: Bool[Array, " n"]) -> AllCandidates:
-        """Candidate actions where an action of a state is drawn, brought up to date after some objects moved."""
+        """Candidate actions of a state, brought up to date after some objects moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        scene = self.drawn_in(self.present, state).scene
-        return all_candidates(self.problem.space, scene, possible, state.candidates, moved, state.able)
+        return all_candidates(self.problem.space, state.scene, possible, state.candidates, moved, state.able)
 
     def up_to_date(self, state: State) -> State:
         """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
@@ -158,8 +154,7 @@ class Rollout:
         return self.objective.cost(self.problem, self.belief, state, self.config.weights)
 
     def _proposed(self, state: State, key: Array) -> Sample:
-        drawn_in = self.drawn_in(self.present, state)
-        return self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, drawn_in)
+        return self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, state)
 
     def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
         sample = self._proposed(state, key)
@@ -167,10 +162,8 @@ class Rollout:
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
         """An action and its prediction, drawn again until it is possible, at most as often as `config` allows."""
-        most = max(self.config.draws, self.config.first_draws)
-        if most == 1:
-            return self._attempt(first, state, key)
-        draws = jnp.where(first, most, self.config.draws)
+        most, later = self.config.draws
+        draws = jnp.where(first, most, later)
         attempt = lambda state, i: self._attempt(first, state, jax.random.fold_in(key, i))  # noqa: E731
         if not on_cpu():
             return _draw_all(attempt, state, draws, most)
@@ -182,7 +175,7 @@ class Rollout:
         sample, prediction = self._draw(first, state, key)
         acted = prediction.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
-        spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.move_again)
+        spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.as_in_paper)
         moved = prediction.moved & acted
         target_at = state.target_at
         if self.config.move_target:
@@ -202,8 +195,7 @@ class Rollout:
         space that was not measured.
         """
         possible = possible_space(self.problem, self.belief, state.exists)
-        scene = self.drawn_in(self.present, state).scene
-        return contact_probability(self.problem.space, scene, possible, sample)
+        return contact_probability(self.problem.space, state.scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """Advance all sequences by one action: the states after it, and records of the states before it."""
@@ -286,7 +278,6 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     config = rollout.config
     count, horizon = config.sequences, config.horizon
     root = rollout.root(objects)
-    rollout = dataclasses.replace(rollout, present=root.scene)
     states = repeated(root, count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
     _, (actions, cost, penalty, scenes) = jax.lax.scan(

@@ -131,12 +131,12 @@ def box_around(target: Target, T_world_target: Float[Array, "4 4"]) -> Superquad
     )
 
 
-def surface_cloud(target: Target, count: int, erosion: float) -> Float[np.ndarray, "n 3"]:
-    """`count` points on the surface of the target shrunk by `erosion`, in its own frame [m]."""
+def surface_cloud(target: Target, count: int) -> Float[np.ndarray, "n 3"]:
+    """`count` points on the surface of the target, in its own frame [m]."""
     if target.compound is None:
         sample = jax.jit(superquadric.sample_surface, static_argnames="count")
-        half = np.array(target.half_size, np.float32) - np.float32(erosion)
+        half = np.array(target.half_size, np.float32)
         return np.asarray(sample(half, np.array(target.exponents, np.float32), count=count))
-    points = solid.surface(target.compound, count, erosion).astype(np.float32)
+    points = solid.surface(target.compound, count).astype(np.float32)
     # As many for every target, so that all share their programs.
     return points[np.arange(count) % len(points)]

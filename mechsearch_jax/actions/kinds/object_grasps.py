@@ -14,7 +14,6 @@ from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.options import option
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Least distance of the palm from an object's front, and of the finger tips' centres from the board [m].
@@ -77,14 +76,8 @@ class ObjectGraspConfig:
         BoxGrasp(face=1, turn=1.0),
     )
     round_drops: tuple[float, ...] = (0.03, 0.04)
-    tilts: tuple[float, ...] = option(
-        (math.radians(10), math.radians(20), math.radians(30)),
-        "angles by which the gripper points downwards as it grasps an object [rad]; the paper's is 0.35",
-    )
-    max_yaw: float = option(
-        math.radians(90),
-        "largest angle between the approach to an object's flat side and straight into the shelf, at most 1.571 [rad]",
-    )
+    tilts: tuple[float, ...] = (math.radians(10), math.radians(20), math.radians(30))
+    max_yaw: float = math.radians(90)
     max_turn: float = math.radians(22)
     min_turn: float = math.radians(5)
     turn_gap: float = 0.004

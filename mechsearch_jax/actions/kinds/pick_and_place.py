@@ -98,7 +98,7 @@ class PickAndPlace:
     ) -> Bool[Array, "n v d"]:
         """Whether the gripper enters possible space as it grasps; `placement` tests where the object is put."""
         n, v, d = candidates.reached.shape
-        usable = candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None] & space.config.avoid_unseen
+        usable = candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None] & (not space.config.as_in_paper)
         cloud = cloud_index(space.tables, OPEN, np.tile(self.wrists(space), n))
         T = candidates.T_world_gripper.reshape(-1, 4, 4)
         return approach_enters(space.tables, possible, cloud, T, usable.reshape(-1)).reshape(n, v, d)

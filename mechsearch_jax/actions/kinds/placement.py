@@ -130,7 +130,7 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     body = clouds_of(cloud.T[None])
     overlaps = collisions(body, np.zeros(tries, np.int32), make(rotation, position), wider, mask, own=True)
     overlapping = jnp.any(overlaps, axis=1)
-    intrudes = jnp.any(enters(possible, points), axis=1) & config.avoid_unseen
+    intrudes = jnp.any(enters(possible, points), axis=1) & (not config.as_in_paper)
     score = order - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
     if scene.parts is not None:
         # Such a body is often held by a narrow part, a neck, and let go askew. Which part holds it is not considered.

@@ -224,7 +224,7 @@ class Push:
         n, v, d = candidates.reached.shape
         tables, wrist, owner = space.tables, np.tile(self.wrists(space), n), np.repeat(np.arange(n), v)
         clouds = object_clouds(scene, space.config.object_points)
-        usable = candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None] & space.config.avoid_unseen
+        usable = candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None] & (not space.config.as_in_paper)
         shift = self._displacements(space, n)
 
         def enters(grippers, scene, row):

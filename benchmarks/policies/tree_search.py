@@ -1,4 +1,5 @@
-"""Monte-Carlo tree search over predicted states, a baseline that plans with the engine's slots.
+"""Monte-Carlo tree search over predicted states, `mechsearch_jax.benchmarks.policies.tree_search:mctx`, which plans
+with the engine's slots.
 
 The search is DeepMind's `mctx` (https://github.com/google-deepmind/mctx), with its Gumbel MuZero policy and the
 planner's model. A node is a predicted state; its discrete actions are samples, each drawn and predicted when it is
@@ -20,8 +21,8 @@ from jaxtyping import Array
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner import PlannerConfig, PlanningPolicy, search_for_grasp
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
 from mechsearch_jax.runtime.errors import InputError
@@ -172,3 +173,13 @@ def _decision(rollout: Rollout, begin: Node, result: Any, objects: Superquadrics
         sequences=sequences,
         refused=jnp.int32(0),
     )
+
+
+def mctx(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
+    """Tree search on the cost of `search_for_grasp`; see `planner.policies.PolicyFactory`.
+
+    Raises:
+      InputError: the library `mctx` is not installed.
+    """
+    import_mctx()
+    return search_for_grasp(config, **slots).replace(plan=tree_plan)

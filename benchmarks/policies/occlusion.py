@@ -1,4 +1,5 @@
-"""A baseline without look-ahead: it moves the object that occludes most.
+"""A policy without look-ahead, `mechsearch_jax.benchmarks.policies.occlusion:most_occluding`: it moves the object that
+occludes most.
 
 See docs/method.md, "Policies to compare with".
 
@@ -8,7 +9,8 @@ grasps as would hit the object.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.existence import occluders
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner import PlannerConfig, PlanningPolicy, search_and_grasp
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.proposal import WeightedDraw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
@@ -133,3 +136,22 @@ def plan_by_occlusion(rollout: Rollout, key: Array, objects: Superquadrics) -> D
 def _rows(which: Bool[Array, " s"], like: Array) -> Bool[Array, "s *ones"]:
     """A mask of rows that broadcasts against an array."""
     return which.reshape(-1, *[1] * (like.ndim - 1))
+
+
+def most_occluding(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
+    """Moves the object that hides the most possible poses, by any action; see `planner.policies.PolicyFactory`.
+
+    Once the target is found: the object that the most of its grasps hit.
+
+    If no action of the object is possible, the next one in that order is moved. It does not plan ahead and does not
+    move a found target: of `config`, the horizon, `move_target` and what is as in J or in the guided draws is ignored.
+    """
+    plain = dataclasses.replace(
+        config or PlannerConfig(),
+        horizon=1,
+        move_target=False,
+        guided_fraction=0.0,
+        crowding_weight=0.0,
+        unseen_contact_penalty=0.0,
+    )
+    return search_and_grasp(plain, propose=draw_by_occlusion, **slots).replace(plan=plan_by_occlusion)

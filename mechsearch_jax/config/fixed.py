@@ -1,0 +1,88 @@
+"""Options that this version has no more, and the values that they are fixed at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+# What stands in options of a row or an episode for all that preset `paper` has otherwise and is no option.
+AS_IN_PAPER = "as_in_paper"
+
+
+class Fixed(NamedTuple):
+    """What an option is fixed at.
+
+    Attributes:
+      value: in preset `standard`, as JSON has it.
+      in_paper: in preset `paper`.
+    """
+
+    value: Any
+    in_paper: Any
+
+
+def _degrees(*angles: int) -> list[float]:
+    return [math.radians(angle) for angle in angles]
+
+
+# By the option's name, as files and rows of results have it.
+FIXED: Mapping[str, Fixed] = {
+    "protocol": Fixed("strict", "strict"),
+    "imitates": Fixed("nothing", "nothing"),
+    "unseen_contact_penalty": Fixed(1.0, 0.0),
+    "guided_fraction": Fixed(0.7, 0.0),
+    "crowding_weight": Fixed(0.02, 0.0),
+    "draws": Fixed(1, 8),
+    "first_draws": Fixed(4, 1),
+    "move_again": Fixed(False, True),
+    "predicted_collisions": Fixed(False, True),
+    "avoid_unseen": Fixed(True, False),
+    "criterion": Fixed("detector", "depth-mse"),
+    "cell_reach": Fixed([1.0], [0.5]),
+    "closer_look": Fixed(3, 0),
+    "erosion": Fixed(0.0, 0.0),
+    "reopen": Fixed(True, False),
+    "grasp_max_yaw": Fixed(math.radians(45), math.radians(45)),
+    "grasp_tilts": Fixed(_degrees(20, 25, 30), _degrees(20)),
+    "retrieval_max_yaw": Fixed(math.radians(75), math.radians(45)),
+    "retrieval_tilts": Fixed(_degrees(20, 25, 30), _degrees(20)),
+    "object_grasp_tilts": Fixed(_degrees(10, 20, 30), _degrees(20)),
+    "object_grasp_max_yaw": Fixed(math.radians(90), math.radians(45)),
+}
+
+
+def refusal(name: str) -> str | None:
+    """What to say to who gives an option that is fixed now, in one line; None if the name is of no such option.
+
+    Args:
+      name: with underscores, or as on the command line.
+    """
+    given = name.partition("=")[0]
+    fixed = FIXED.get(given.removeprefix("--").replace("-", "_"))
+    if fixed is None:
+        return None
+    paper = "" if fixed.in_paper == fixed.value else f" (in preset paper at {_text(fixed.in_paper)})"
+    return f"{given} is no option any more: it is fixed at {_text(fixed.value)}{paper}; leave it out"
+
+
+def without_fixed(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a row or an episode of an earlier version, as this version has them.
+
+    What is fixed now is left out where it had the value that it has in a preset, and `AS_IN_PAPER` says in which.
+    """
+    former = {name: value for name, value in options.items() if name in FIXED}
+    rest = {name: value for name, value in options.items() if name not in FIXED}
+    if not former:
+        return rest
+    if any(value != FIXED[name].value for name, value in former.items()) and all(
+        value == FIXED[name].in_paper for name, value in former.items()
+    ):
+        return {AS_IN_PAPER: True, **rest}
+    others = {name: value for name, value in former.items() if value != FIXED[name].value}
+    return {AS_IN_PAPER: False, **rest, **others}
+
+
+def _text(value: Any) -> str:
+    values = value if isinstance(value, list) else [value]
+    return " ".join(f"{part:.4g}" if isinstance(part, float) else str(part) for part in values)
