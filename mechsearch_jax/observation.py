@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics, as_boxes
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 
 
 class Observation(flax.struct.PyTreeNode):
@@ -50,6 +50,6 @@ def _may_turn(objects: Superquadrics) -> bool:
     return isinstance(described, Tracer) or bool(np.any(np.asarray(described)[..., 1] > 2.0 - ROUND_EXPONENT))
 
 
-@kept()
+@cached_jit()
 def _with_boxes(objects: Superquadrics) -> Superquadrics:
     return as_boxes(objects)

@@ -35,7 +35,7 @@ from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses, way_in
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import JOINTS
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -262,8 +262,8 @@ def crossing_hits(
     return jnp.any(hits.reshape(g, p, n), axis=1)
 
 
-@kept()
-def worth_trying(
+@cached_jit()
+def top_grasps(
     grasps: TargetGrasps,
     scene: Superquadrics,
     pose: Float[Array, "3"],
@@ -290,7 +290,7 @@ def worth_trying(
     return jax.vmap(lambda i: _choice(grasps, ranked, i))(best)
 
 
-@kept()
+@cached_jit()
 def best_grasp(
     grasps: TargetGrasps,
     scene: Superquadrics,

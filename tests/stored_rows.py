@@ -3,7 +3,7 @@
 import functools
 import json
 
-from mechsearch_jax.benchmarks.store.rows import Row, configuration
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration
 from mechsearch_jax.envs.episode.method import Method
 
 VERSIONS = json.dumps({"jax": "0.11.2", "machine": "x86_64", "mujoco": "3.17.0", "numpy": "2.5.2", "python": "3.12.3"})
@@ -42,4 +42,4 @@ def row_of(scene, method=USUAL, seed=0, **fields):
         "device": "cuda: H100",
         "versions": VERSIONS,
     }
-    return Row(**usual | fields)
+    return EpisodeRow(**usual | fields)

@@ -12,7 +12,7 @@ from stage import HIDDEN, OPEN, Stage
 from mechsearch_jax.benchmarks.running import batches
 from mechsearch_jax.benchmarks.running.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
-from mechsearch_jax.benchmarks.running.in_turn import InTurn
+from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.store.rows import identity
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.method import Method
@@ -210,7 +210,7 @@ def test_what_differs_in_numbers_alone_is_one_batch(problem, tmp_path, files, mo
         *(Method(config=PRESETS["standard"](**change)) for change in ({"horizon": 2}, {"push_distances": (0.1,)})),
         *(Method("search-and-grasp"), Method(recognition="masks"), Method()),
     ]
-    assert len({method.mould() for method in others}) == len(others)
+    assert len({method.compile_key() for method in others}) == len(others)
     stand.slots.clear()
     evaluate(make_jobs(files, others, (0,)), tmp_path / "others", Batches(worlds=30))
     assert stand.slots == [len(files)] * len(others)
@@ -244,7 +244,7 @@ def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
     if how == "batch":
         rows = evaluate(jobs, tmp_path / "rows", Batches(worlds=2))
     else:
-        worker = InTurn()
+        worker = SequentialRunner()
         worker._simulator = functools.cache(QuickStage)
         rows = [worker.run(job) for job in jobs]
     assert len({identity(row) for row in rows}) == 96

@@ -18,8 +18,8 @@ from mechsearch_jax.benchmarks.running.batches import Batches
 from mechsearch_jax.benchmarks.running.cluster import MOST_DEATHS, RayCluster, join
 from mechsearch_jax.benchmarks.running.cluster_workers import OnCpus, OnGpus, Worker
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
-from mechsearch_jax.benchmarks.running.in_turn import InTurn
 from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, Processes
+from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.commands.options import EpisodeOptions
 from mechsearch_jax.commands.runs import Here, OnRay, RunOptions
@@ -106,7 +106,7 @@ def at_once(starts, problem, policy, simulator, slots, listeners, settings):
         listeners.ended([(place, Episode(*facts))])
 
 
-class Known(InTurn):
+class Known(SequentialRunner):
     """The real thing, but it tells which process it is."""
 
     def __init__(self, folder):

@@ -10,13 +10,13 @@ import pytest
 from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.guard.guard import Outcome, compare, detectable, power, sign_test, suite
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.bench import episodes
 from mechsearch_jax.envs.scenes.scene_sets import recorded
 from mechsearch_jax.runtime.errors import InputError
 
-ROW = Row(
+ROW = EpisodeRow(
     "one", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.5, "{}", "00"
 )  # fmt: skip
 

@@ -17,10 +17,10 @@ from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
 from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
-from mechsearch_jax.benchmarks.store.rows import EVENTS, Row, write_rows
+from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, write_rows
 from mechsearch_jax.runtime.errors import InputError
 
-WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
+WON = EpisodeRow("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
 LOST = dataclasses.replace(
     WON, scenario="b", graspable_step=None, retrieved=False, steps=10, failure="found, but not graspable"
 )

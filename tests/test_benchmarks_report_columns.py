@@ -20,11 +20,11 @@ from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figur
 from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES, write_report
 from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
-from mechsearch_jax.benchmarks.running.in_turn import InTurn
+from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.statistics.paired import paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, episode_key, options_of, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -36,7 +36,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
-WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.6)
+WON = EpisodeRow("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.6)
 LOST = dataclasses.replace(WON, found_step=None, graspable_step=None, retrieved=False, steps=10, failure="not found")
 
 
@@ -393,7 +393,7 @@ def check_evidence(step, row, scenario):
 def test_an_episode_is_replayed_from_its_row(tmp_path, monkeypatch):
     file = example_scenarios()["first-light"]
     (job,) = make_jobs([file], [Method(config=PRESETS["standard"](max_steps=1, sequences=5, horizon=1))], (3,))
-    row = InTurn().run(job)
+    row = SequentialRunner().run(job)
     assert Method.of_options(options_of(row)).options()["max_steps"] == 1
     recordings = []
     write = page.save_page

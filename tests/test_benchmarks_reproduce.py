@@ -32,7 +32,7 @@ from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, wilson
-from mechsearch_jax.benchmarks.store.rows import Row, configuration
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import reproduce as command
@@ -42,7 +42,9 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
-ROW = Row("a", 2, "cylinder", METHODS[1], "oracle", 0.9, 3, 30, "push+pick-and-place", 0, 1, 2, True, 3, None, 1.5, 0.6)
+ROW = EpisodeRow(
+    "a", 2, "cylinder", METHODS[1], "oracle", 0.9, 3, 30, "push+pick-and-place", 0, 1, 2, True, 3, None, 1.5, 0.6
+)
 FOR = Setting(METHODS[1], "masks", BOTH, "paper")
 AND = FOR._replace(method=METHODS[0])
 

@@ -12,7 +12,7 @@ from mechsearch_jax.benchmarks.parts import scaling
 from mechsearch_jax.benchmarks.report.report_bench import drawn_rows
 from mechsearch_jax.benchmarks.running import processes
 from mechsearch_jax.benchmarks.running.evaluate import present_code
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
@@ -142,7 +142,7 @@ def test_rows_are_timed_as_they_come(tmp_path):
     assert sorted(map(repr, read)) == sorted(map(repr, rows))
     assert len(times) == 8
     assert times == sorted(times)
-    assert isinstance(read[0], Row)
+    assert isinstance(read[0], EpisodeRow)
 
 
 @pytest.mark.parametrize("script", ["raise SystemExit('mechsearch: no GPU')", "print('mechsearch: no GPU')"])

@@ -15,11 +15,18 @@ import pytest
 from mechsearch_jax.benchmarks.report.report import read_tables
 from mechsearch_jax.benchmarks.store import claims as claiming
 from mechsearch_jax.benchmarks.store.claims import CLAIMS, Claims
-from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, parse_row, read_rows, write_rows
+from mechsearch_jax.benchmarks.store.rows import (
+    EpisodeRow,
+    configuration,
+    episode_key,
+    parse_row,
+    read_rows,
+    write_rows,
+)
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
 from mechsearch_jax.runtime.errors import InputError
 
-ROW = Row(
+ROW = EpisodeRow(
     "a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.6,
     configuration({"gamma": 0.9}), "00", code="this",
 )  # fmt: skip

@@ -18,8 +18,7 @@ from mechsearch_jax.benchmarks.ceiling.solvability import Ceiling, Outcomes, Row
 from mechsearch_jax.benchmarks.ceiling.unsolved import blockers, in_the_way, reason
 from mechsearch_jax.benchmarks.report.episode_tables import ceiling_table
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
-from mechsearch_jax.benchmarks.store.rows import Row as EpisodeRow
-from mechsearch_jax.benchmarks.store.rows import write_rows
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.envs.episode.records import ActionRecord
 from mechsearch_jax.envs.known_target.judgement import Judgement

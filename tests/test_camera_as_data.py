@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
 from mechsearch_jax.images.cloud import BLOCK, thinned_view, view
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.runtime.compiled import Kept, keep_in
+from mechsearch_jax.runtime.compiled import CachedJit, keep_in
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
@@ -100,8 +100,8 @@ def test_what_was_kept_on_disk_is_found_for_another_pose(tmp_path):
     # As a function of a module, which another process finds.
     small = [camera.scaled(20) for camera in (Camera(), NEW)]
     keep_in(tmp_path)
-    first = Kept(depths, ())(small[0], OBJECTS)
-    again = Kept(depths, ())
+    first = CachedJit(depths, ())(small[0], OBJECTS)
+    again = CachedJit(depths, ())
     assert again.is_ready(small[1], OBJECTS)
     second = again(small[1], OBJECTS)
     assert traced == ["depths"]

@@ -13,7 +13,7 @@ import pytest
 
 from mechsearch_jax.benchmarks.report.report_files import FILES
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
-from mechsearch_jax.benchmarks.store.rows import Row, write_rows
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import options
 from mechsearch_jax.envs.episode.records import Episode, save_episode
@@ -37,7 +37,9 @@ SCENE = Scenario(
 )
 
 
-ROW = Row("one-box", 1, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.5)
+ROW = EpisodeRow(
+    "one-box", 1, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.5
+)
 
 
 def mechsearch(folder, *arguments):

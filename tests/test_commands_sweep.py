@@ -91,7 +91,7 @@ def test_worlds_that_differ_are_swept_and_share_a_compilation(jobs_of):
     jobs = jobs_of("sweep", "one.json", "--world-friction", "0.5", "1", "2", "--world-physics", "usual", "fine-step")
     expected = {(f, p) for f in (0.5, 1.0, 2.0) for p in ("usual", "fine-step")}
     assert {(job.method.mismatch.friction, job.method.mismatch.physics) for job in jobs} == expected
-    assert len({job.method.mould() for job in jobs}) == 1
+    assert len({job.method.compile_key() for job in jobs}) == 1
     assert len({job.key for job in jobs}) == len(jobs) == 6
     assert [job.key for job in jobs if job.method == Method()] == [job.key for job in plain]
     (swept,), (evaluated,) = (jobs_of(command, "one.json", "--shelf-turn", "2") for command in ("sweep", "evaluate"))

@@ -15,7 +15,7 @@ import pytest
 
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.runtime import compiled, executables
-from mechsearch_jax.runtime.compiled import Kept, KeptOnHost, keep_in
+from mechsearch_jax.runtime.compiled import CachedJit, CachedJitOnHost, keep_in
 from mechsearch_jax.runtime.identity import Unidentified, identity
 from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
@@ -36,7 +36,7 @@ def called_back(value):
 def another_process(function=scaled, static=("camera",)):
     """The function as a new process knows it: not at all."""
     TRACED.clear()
-    return Kept(function, static)
+    return CachedJit(function, static)
 
 
 def as_numbers(tree):
@@ -214,7 +214,7 @@ def test_what_is_wrong_with_what_is_prepared_is_said_there_and_by_a_call():
     def wrong(values):
         raise ValueError("wrong")
 
-    function = Kept(wrong, on_disk=False)
+    function = CachedJit(wrong, on_disk=False)
     for _ in range(2):
         with pytest.raises(ValueError, match="wrong"):
             function.begin(VALUES)
@@ -224,7 +224,7 @@ def test_what_is_wrong_with_what_is_prepared_is_said_there_and_by_a_call():
 
 def test_what_depends_on_more_than_its_arguments_stays_out_of_the_folder(folder):
     for factor in (2.0, 3.0):
-        function = Kept(lambda values, factor=factor: values * factor, on_disk=False)
+        function = CachedJit(lambda values, factor=factor: values * factor, on_disk=False)
         function.prepare(VALUES)
         assert float(function(VALUES)[0]) == factor
     assert not folder.exists()
@@ -246,11 +246,11 @@ def test_beside_a_gpu_the_host_computes_what_is_for_it(folder, monkeypatch):
         devices.append(getattr(jax.default_device.value, "platform", None))
         return 2.0 * values
 
-    on_a_cpu = KeptOnHost(doubled, on_disk=False)
+    on_a_cpu = CachedJitOnHost(doubled, on_disk=False)
     np.testing.assert_array_equal(on_a_cpu(VALUES), 2.0 * VALUES)
     assert devices == [None]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    beside = KeptOnHost(doubled)
+    beside = CachedJitOnHost(doubled)
     beside.begin(VALUES)()
     assert beside.is_ready(VALUES)
     np.testing.assert_array_equal(beside(jnp.asarray(VALUES)), 2.0 * VALUES)
@@ -307,7 +307,7 @@ def test_an_option_that_xla_does_not_know_is_done_without(folder, monkeypatch):
     assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
 
 
-class Colour(compiled.Kept):
+class Colour(compiled.CachedJit):
     pass
 
 

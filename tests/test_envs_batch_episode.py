@@ -14,7 +14,7 @@ from mechsearch_jax.envs.camera.snapshot import informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
-from mechsearch_jax.envs.episode.policy_numbers import mould
+from mechsearch_jax.envs.episode.policy_numbers import compile_key
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
@@ -140,8 +140,8 @@ def test_policies_that_differ_in_numbers_share_a_batch_and_what_is_compiled(prob
 
 def test_policies_that_differ_in_more_than_numbers_do_not_share_a_batch(problem):
     first = Counting(tilt=jnp.zeros(3))
-    assert mould(first) == mould(first.replace(charge=0.5, tilt=jnp.zeros(3)))
-    assert mould(grab) != mould(first) != mould(Counting())
+    assert compile_key(first) == compile_key(first.replace(charge=0.5, tilt=jnp.zeros(3)))
+    assert compile_key(grab) != compile_key(first) != compile_key(Counting())
     for other in (first.replace(far=True), first.replace(tilt=jnp.ones(3)), grab):
         starts = [Start(OPEN, 0, first), Start(OPEN, 0, other)]
         with pytest.raises(InputError, match="differ in more than numbers"):

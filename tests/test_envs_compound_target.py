@@ -21,7 +21,7 @@ from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials import native as trials
 from mechsearch_jax.envs.world import model
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.world import (
     BODIES,
     TARGET,
@@ -163,7 +163,7 @@ def test_the_hand_takes_it_out():
 
 
 def test_a_found_target_stands_in_trials_as_what_it_is():
-    cell, simulation = trials.Cell(MUG, SHELF, Gripper()), SimulatorConfig()
+    cell, simulation = trials.TrialSetup(MUG, SHELF, Gripper()), SimulatorConfig()
     at, nothing = jnp.array([0.6, 0.1, 0.5]), jax.device_get(empty(TARGET))
     for found in (True, False):
         world = jax.device_get(trials.trial_world(MUG, SHELF, nothing, at, jnp.array(found)))
@@ -181,7 +181,7 @@ def test_a_found_target_stands_in_trials_as_what_it_is():
 def test_the_batch_model_holds_the_target_itself():
     scenes = [hidden(TENT, BOX, yaw=0.5), hidden(TENT, standing(MUG, 0.5, -0.1), x=0.7)]
     factors = np.linspace(0.5, 1.5, BODIES)
-    cells = [ASSUMED_CELL, ActualCell(friction=0.5, mass=2.0, body_friction=factors, body_mass=factors[::-1])]
+    cells = [ASSUMED_CELL, TrueCell(friction=0.5, mass=2.0, body_friction=factors, body_mass=factors[::-1])]
     worlds = [from_scenario(scene) for scene in scenes]
     world = jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *worlds)
     assert room_for(world) == {**ROOM, TARGET: TENT.compound}

@@ -27,7 +27,7 @@ from stage import (
 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.camera.snapshot import (
     Snapshot,
     informed,
@@ -409,7 +409,7 @@ def test_every_step_says_whether_the_truth_is_possible(problem):
     assert [step.truth_possible for step in episode.steps] == [True, False, False]
     assert [step.around_possible for step in episode.steps] == [True, False, False]
     assert [step.restarts for step in episode.steps] == [0, 0, 0]
-    row = Row.of_episode(dataclasses.replace(episode, config={**METHOD, **episode.config}))
+    row = EpisodeRow.of_episode(dataclasses.replace(episode, config={**METHOD, **episode.config}))
     assert (row.looks, row.truth_lost, row.truth_lost_step, row.restarts) == (3, 2, 1, 0)
     assert (row.truth_ruled_out, row.truth_ruled_out_step) == (2, 1)
     episode = run(problem, HIDDEN, Stage(reveal))

@@ -58,8 +58,8 @@ def test_every_name_has_holes_and_none_is_as_before(world, image):
     assert tuple(HOLES) == get_args(HolesName)
     assert sensed("none") is None
     assert sensed_depth(SMALL, world, image, None) is image.depth
-    assert ASSUMED.mould() == Mismatch(holes="none").mould() != Mismatch(holes="patches").mould()
-    assert Mismatch(holes="shadows").mould() == Mismatch(holes="patches").mould()
+    assert ASSUMED.compile_key() == Mismatch(holes="none").compile_key() != Mismatch(holes="patches").compile_key()
+    assert Mismatch(holes="shadows").compile_key() == Mismatch(holes="patches").compile_key()
     assert "mismatch.holes" not in Method().options()
     method = Method(mismatch=Mismatch(holes="shadows"))
     assert method.options()["mismatch.holes"] == "shadows"

@@ -401,5 +401,5 @@ def test_episodes_of_an_arm_that_stops_learn_with_its_bound():
     )
     assert stops.trials().arm_stop == 0.03
     assert usual.trials().arm_stop == SimulatorConfig().tracking_bound
-    assert stops.mould() != usual.mould()
-    assert Method(mismatch=Mismatch(arm_stop=0.03)).mould() == Method().mould()
+    assert stops.compile_key() != usual.compile_key()
+    assert Method(mismatch=Mismatch(arm_stop=0.03)).compile_key() == Method().compile_key()

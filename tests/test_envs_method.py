@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.config.fixed import AS_IN_PAPER, FIXED
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
@@ -78,7 +78,7 @@ def test_the_row_of_a_job_is_that_of_its_episode():
     # What a row does not know of an episode that was not run to its end.
     unknown = {"compile_seconds": None, "device": None, "versions": None}
     unknown["decision_version"] = DECISION_VERSION
-    assert dataclasses.replace(Row.of_episode(episode, present_code()), **unknown) == job.failed("no")
+    assert dataclasses.replace(EpisodeRow.of_episode(episode, present_code()), **unknown) == job.failed("no")
 
 
 def test_a_policy_of_another_module_is_found(tmp_path, monkeypatch):

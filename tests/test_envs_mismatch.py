@@ -362,14 +362,17 @@ def test_rows_keep_what_differs_alone():
 
 
 def test_what_is_data_compiles_nothing():
-    def mould(**mismatch):
-        return Method(recognition="masks", mismatch=Mismatch(**mismatch)).mould()
+    def compile_key(**mismatch):
+        return Method(recognition="masks", mismatch=Mismatch(**mismatch)).compile_key()
 
-    assert mould(friction=0.5) == mould(friction=2.0, mass=2.0, physics="fine-step") == mould()
-    assert mould(camera_shift=0.01) == mould(camera_turn=2.0, friction=2.0) == mould(shelf_shift=0.01)
-    assert mould(depth_noise=0.002) == mould(missing_depth=0.1)
-    assert mould(exposure=0.5) == mould(color_noise=0.0, hue_gap=0.0, white_balance=0.1)
-    assert len({mould(), mould(camera_shift=0.01), mould(depth_noise=0.002), mould(exposure=0.5)}) == 4
+    assert compile_key(friction=0.5) == compile_key(friction=2.0, mass=2.0, physics="fine-step") == compile_key()
+    assert compile_key(camera_shift=0.01) == compile_key(camera_turn=2.0, friction=2.0) == compile_key(shelf_shift=0.01)
+    assert compile_key(depth_noise=0.002) == compile_key(missing_depth=0.1)
+    assert compile_key(exposure=0.5) == compile_key(color_noise=0.0, hue_gap=0.0, white_balance=0.1)
+    assert (
+        len({compile_key(), compile_key(camera_shift=0.01), compile_key(depth_noise=0.002), compile_key(exposure=0.5)})
+        == 4
+    )
 
 
 def test_every_world_of_a_simulator_has_its_own_cell():

@@ -16,7 +16,7 @@ from mechsearch_jax.envs.simulators.compound_batch import ROOM, ROWS, check_room
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, alike, from_scenario, slots
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import PRIMITIVES
@@ -66,7 +66,7 @@ def blank():
 
 def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     factors = np.linspace(0.5, 1.5, BODIES)
-    other = ActualCell(friction=0.5, mass=2.0, body_friction=factors, body_mass=factors[::-1])
+    other = TrueCell(friction=0.5, mass=2.0, body_friction=factors, body_mass=factors[::-1])
     scenes, cells = [THINGS, OTHERS, PLAIN], [ASSUMED_CELL, other, ASSUMED_CELL]
     fields = jax.jit(functools.partial(compound_fields, blank()))(stack(scenes), cells_of(blank(), cells))
     for w, (scene, cell) in enumerate(zip(scenes, cells, strict=True)):

@@ -23,7 +23,7 @@ from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import model
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell, Mismatch
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, Mismatch, TrueCell
 from mechsearch_jax.envs.world.outcome import Failure, Overflow
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, slots
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -68,7 +68,7 @@ def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     scenes = [scene(BOX, BOTTLE), scene(), scene(*[BOTTLE] * 8, target=standing("box", (0.015, 0.02, 0.05), 0.6, 0.1))]
     worlds = stack(*[from_scenario(s) for s in scenes])
     moved = Mismatch(friction=0.5, mass=2.0, friction_spread=2.0, mass_spread=1.5, shelf_shift=0.01, shelf_turn=2.0)
-    cells = [ASSUMED_CELL, moved.drawn(scenes[1], 0, Camera(), Shelf()), ActualCell(friction=2.0)]
+    cells = [ASSUMED_CELL, moved.drawn(scenes[1], 0, Camera(), Shelf()), TrueCell(friction=2.0)]
     of_worlds = jax.jit(partial(body_fields, blank))
     fields = of_worlds(worlds.kind, worlds.half_size, worlds.valid, cells_of(blank, cells))
     for i, (start, cell) in enumerate(zip(scenes, cells, strict=True)):
@@ -258,9 +258,9 @@ def test_every_world_has_its_own_cell(sim):
         field = np.asarray(getattr(sim._fields, name))
         np.testing.assert_array_equal(field[1:3], field[:1].repeat(2, axis=0))
     with pytest.raises(InputError, match="usual physics"):
-        sim.set_cells({0: ActualCell(physics="fine-step")})
+        sim.set_cells({0: TrueCell(physics="fine-step")})
     with pytest.raises(InputError, match="the arm never stops"):
-        sim.set_cells({0: ActualCell(arm_stop=0.04)})
+        sim.set_cells({0: TrueCell(arm_stop=0.04)})
 
 
 @pytest.mark.slow

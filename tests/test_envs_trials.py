@@ -23,7 +23,7 @@ from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
-from mechsearch_jax.envs.trials.nearby import Nearby
+from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
@@ -32,7 +32,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, decide, scenes_of
-from mechsearch_jax.retrieval import ALIKE, ALIKE_WRIST, best_grasp, worth_trying
+from mechsearch_jax.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.runtime.errors import InputError
 
 TARGET = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.0)
@@ -128,7 +128,7 @@ def retrievals(problem):
     rehearsed = {}
     for name, objects in SCENES.items():
         seen, at = objects_and_pose(problem, objects)
-        tried = worth_trying(problem.target_grasps, seen, at)
+        tried = top_grasps(problem.target_grasps, seen, at)
         rehearsed[name] = tried, results_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
     return rehearsed
 
@@ -161,9 +161,9 @@ def test_a_grasp_has_to_succeed_in_the_scenes_nearby_too(problem, retrievals):
     for name in names:
         tried, results = retrievals[name]
         seen, at = objects_and_pose(problem, SCENES[name])
-        alone = NativeTrials(nearby=Nearby(scenes=0))
+        alone = NativeTrials(nearby=Perturbations(scenes=0))
         plain = results_of(alone, problem, seen, at, True, tried.action, tried.feasible)
-        far = NativeTrials(nearby=Nearby(scenes=3, place=0.02))
+        far = NativeTrials(nearby=Perturbations(scenes=3, place=0.02))
         strict = results_of(far, problem, seen, at, True, tried.action, tried.feasible)
         done = [int(np.argmax(np.append(r, DONE) == DONE)) for r in (plain, results, strict)]
         assert done == sorted(done), name
@@ -503,7 +503,7 @@ def test_without_contact_no_grasp_that_hits_something_takes_the_target_out(probl
     strict = search_for_grasp(tries=True, retrieval_contact=False).replace(plan=planned(aside))
     for objects, worth, takes in ((LOOSE, False, False), (FIRM, False, False), (OPEN, True, True)):
         belief, observation = look(problem, objects)
-        grasps = worth_trying(problem.target_grasps, *objects_and_pose(problem, objects))
+        grasps = top_grasps(problem.target_grasps, *objects_and_pose(problem, objects))
         offered = strict.retrieval(jax.random.key(0), problem, belief, observation).alternatives.worth
         np.testing.assert_array_equal(offered, grasps.feasible & (grasps.hits == 0))
         assert bool(offered.any()) == worth

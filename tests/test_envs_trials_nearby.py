@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.trials.nearby import Nearby, ScenesNear
+from mechsearch_jax.envs.trials.nearby import Perturbations, PerturbedScenes
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.planner.trials import TrialScenes
 from mechsearch_jax.runtime.errors import InputError
@@ -23,7 +23,7 @@ def scenes(rows):
 
 
 def test_the_same_differences_whatever_else_is_tried():
-    near = Nearby()
+    near = Perturbations()
     one, many = near.drawn(scenes(1), 2), near.drawn(scenes(3), 2)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
         np.testing.assert_array_equal(np.repeat(a, 3, axis=0), b)
@@ -34,7 +34,7 @@ def test_the_same_differences_whatever_else_is_tried():
 
 
 def test_differences_are_as_large_as_they_are_said_to_be():
-    near = Nearby(place=3e-3, size=0.02)
+    near = Perturbations(place=3e-3, size=0.02)
     plain = scenes(1)
     drawn = [near.drawn(plain, n) for n in range(1, 400)]
     places = np.stack([d.objects.position - plain.objects.position for d in drawn])
@@ -51,7 +51,7 @@ def test_differences_are_as_large_as_they_are_said_to_be():
 
 
 def test_things_are_rougher_and_heavier_in_one_scene_and_smoother_and_lighter_in_another():
-    near, plain = Nearby(friction=1.5, mass=2.0), scenes(2)
+    near, plain = Perturbations(friction=1.5, mass=2.0), scenes(2)
     plain = plain.replace(friction=np.float32([1.0, 0.8]))
     drawn = [near.drawn(plain, number) for number in (1, 2, 3, 4)]
     for each, power in zip(drawn, (1, -1, 0, 1), strict=True):
@@ -63,20 +63,20 @@ def test_things_are_rougher_and_heavier_in_one_scene_and_smoother_and_lighter_in
 @pytest.mark.parametrize("name", ["friction", "mass"])
 def test_factors_below_one_are_refused(name):
     for value in (0.9, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=f"Nearby: {name} .* must be a finite factor of at least 1"):
-            Nearby(**{name: value})
+        with pytest.raises(InputError, match=f"Perturbations: {name} .* must be a finite factor of at least 1"):
+            Perturbations(**{name: value})
 
 
 @pytest.mark.parametrize("name", ["scenes", "place", "size"])
 def test_impossible_numbers_are_refused(name):
     for value in (-1, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=f"Nearby: {name} .* must be finite and not negative"):
-            Nearby(**{name: value})
+        with pytest.raises(InputError, match=f"Perturbations: {name} .* must be finite and not negative"):
+            Perturbations(**{name: value})
 
 
 def test_the_number_of_scenes_is_whole():
-    with pytest.raises(InputError, match=r"Nearby: scenes 1\.5 must be a whole number"):
-        Nearby(scenes=1.5)
+    with pytest.raises(InputError, match=r"Perturbations: scenes 1\.5 must be a whole number"):
+        Perturbations(scenes=1.5)
 
 
 def test_a_scene_is_made_once_by_whichever_thread_comes_first():
@@ -87,7 +87,7 @@ def test_a_scene_is_made_once_by_whichever_thread_comes_first():
         time.sleep(0.02)
         return None if number == 1 else f"scene {number}"
 
-    near = ScenesNear(make)
+    near = PerturbedScenes(make)
 
     def take(_):
         begin.wait()

@@ -7,7 +7,7 @@ import pytest
 
 import mechsearch_jax as ms
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.runtime.compiled import Kept
+from mechsearch_jax.runtime.compiled import CachedJit
 from mechsearch_jax.runtime.own_settings import OWN, in_own_settings, own_settings
 
 
@@ -37,7 +37,7 @@ def marked(x):
 
 
 def test_a_kept_function_computes_in_32_bits_and_marks_with_nan(others):
-    kept = Kept(marked, on_disk=False)
+    kept = CachedJit(marked, on_disk=False)
     for prepare in (False, True):
         if prepare:
             kept.prepare(jnp.zeros(2))

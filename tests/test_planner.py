@@ -27,7 +27,7 @@ from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner import rollout as rollouts
 from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
-from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
+from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, propagate_blame, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, repeated, sequence_values
 from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.runtime.errors import InputError
@@ -302,7 +302,7 @@ def test_what_is_in_the_way_alone_matters_most():
 def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
     rng = np.random.default_rng(0)
     n = root.scene.capacity
-    given = jax.jit(passed_on)
+    given = jax.jit(propagate_blame)
     for chance in (0.1, 0.5, 0.8):
         by_kind = [
             w.replace(reached=rng.random(w.reached.shape) < 0.05, hits=rng.random(w.hits.shape) < chance)

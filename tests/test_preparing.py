@@ -17,7 +17,7 @@ from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.planner import policies, search_for_grasp
-from mechsearch_jax.retrieval import worth_trying
+from mechsearch_jax.retrieval import top_grasps
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.session import preparing
 from mechsearch_jax.session.preparing import Preparing, Program, first_decision, motions, prepare, prepared
@@ -176,7 +176,7 @@ def test_what_a_search_compiles_ahead_is_what_it_calls(problem, monkeypatch, cas
     there, belief = objects_on_the_board(snapshot), initial_belief(problem)
     expected = {
         "belief": [(update_belief, (problem, belief, seen, seen, no_action()))],
-        "grasp": [(worth_trying, (problem.target_grasps, seen.objects, belief.found_pose))],
+        "grasp": [(top_grasps, (problem.target_grasps, seen.objects, belief.found_pose))],
         "verdict": [(verdicts.free_in_sets, (verdicts.judged_sets(problem), there, pose))],
         "hits": [(evidence.grasps_at, (problem.target_grasps, there, pose))],
         "g": [(graspability_map, (problem, belief, seen.objects))],

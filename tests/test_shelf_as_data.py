@@ -33,7 +33,7 @@ from mechsearch_jax.problem.problem import build_problem
 from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.runtime.compiled import Kept
+from mechsearch_jax.runtime.compiled import CachedJit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
@@ -72,7 +72,7 @@ def traced_as(tree):
 
 
 def cache_size(function):
-    return function.jitted._cache_size() if isinstance(function, Kept) else function._cache_size()
+    return function.jitted._cache_size() if isinstance(function, CachedJit) else function._cache_size()
 
 
 def test_a_shelf_survives_jax_and_is_what_it_was_outside():

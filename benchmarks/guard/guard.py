@@ -18,7 +18,7 @@ import scipy.stats
 from mechsearch_jax.benchmarks.parts.images import save_rows
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
@@ -58,8 +58,8 @@ class Outcome:
 
     Attributes:
       scenario, content_hash, objects, seed: which episode it is.
-      found, graspable, retrieved, steps, failure: as in `Row`, the first two whether there was such a step; None for
-        `graspable` where that is not known, as in references of which a retrieval counted as graspable.
+      found, graspable, retrieved, steps, failure: as in `EpisodeRow`, the first two whether there was such a step; None
+        for `graspable` where that is not known, as in references of which a retrieval counted as graspable.
     """
 
     scenario: str
@@ -73,7 +73,7 @@ class Outcome:
     failure: str | None
 
     @classmethod
-    def of_row(cls, row: Row) -> Outcome:
+    def of_row(cls, row: EpisodeRow) -> Outcome:
         """The outcome in an episode's row."""
         return cls(
             scenario=row.scenario,
@@ -201,7 +201,7 @@ def detectable(pairs: int, flips: float = FLIPS) -> float:
     return float(next(loss for loss in losses if power(pairs, loss, flips) >= POWER))
 
 
-def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
+def save_reference(rows: Sequence[EpisodeRow], command: str, path: PathLike) -> None:
     """Store the outcomes of the suite for later comparisons.
 
     Args:
@@ -227,7 +227,7 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
     save_rows(head, [Outcome.of_row(row) for row in rows], path)
 
 
-def _shares(rows: Sequence[Row], measure: str) -> dict[int, float]:
+def _shares(rows: Sequence[EpisodeRow], measure: str) -> dict[int, float]:
     """A measure's share of the episodes with each number of objects."""
     groups: dict[int, list[Outcome]] = {}
     for row in sorted(rows, key=lambda row: row.objects):

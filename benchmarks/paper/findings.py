@@ -17,7 +17,7 @@ from mechsearch_jax.benchmarks.paper.reproduce import ANY, Results, Setting, ran
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, share_interval
 from mechsearch_jax.benchmarks.statistics.paired import reached_change, same_episodes, steps_change
 from mechsearch_jax.benchmarks.statistics.rates import scene_of, step_of
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 
 Rule = Literal["more", "fewer", "no difference"]
 Quantity = Literal["find", "grasp", "find_steps", "grasp_steps"]
@@ -145,7 +145,7 @@ class Verdict(NamedTuple):
     verdict: str
 
 
-def goal_of(quantity: Quantity, setting: Setting, row: Row) -> str:
+def goal_of(quantity: Quantity, setting: Setting, row: EpisodeRow) -> str:
     """What counts as the paper's goal, of `rates.GOALS`.
 
     With trials the target is often taken out with a grasp that brushes something, before it is graspable; so it counts
@@ -189,7 +189,7 @@ _Changes = Iterator[tuple[str, str, str, Change]]
 def _within(finding: Finding, tables: Mapping[str, Results]) -> _Changes:
     """The paired differences of a finding within a table, all methods and numbers of objects together."""
     rows = tables[finding.table].rows if finding.table in tables else {}
-    pairs: dict[tuple[str, str, str], list[tuple[Row, Row]]] = {}
+    pairs: dict[tuple[str, str, str], list[tuple[EpisodeRow, EpisodeRow]]] = {}
     for setting, own in rows.items():
         base = setting._replace(**{finding.factor: finding.base})
         if getattr(setting, finding.factor) != finding.value or base not in rows or not ran_alike(own, rows[base]):
@@ -206,9 +206,9 @@ def _within(finding: Finding, tables: Mapping[str, Results]) -> _Changes:
 
 def _between_tables(finding: Finding, tables: Mapping[str, Results]) -> _Changes:
     """The differences of shares of scenes that have nothing in common, by Newcombe's method 10 (1998)."""
-    sides: list[dict[tuple[str, str, str], list[Row]]] = []
+    sides: list[dict[tuple[str, str, str], list[EpisodeRow]]] = []
     for name in (finding.value, finding.base):
-        side: dict[tuple[str, str, str], list[Row]] = {}
+        side: dict[tuple[str, str, str], list[EpisodeRow]] = {}
         for setting, own in (tables[name].rows if name in tables else {}).items():
             if setting.recognition in finding.recognitions:
                 key = setting.part, setting.recognition, goal_of(finding.quantity, setting, own[0])
@@ -221,16 +221,16 @@ def _between_tables(finding: Finding, tables: Mapping[str, Results]) -> _Changes
             yield *key, Change(p - q, interval, len(sides[0][key]), _methods_of(sides[0][key]))
 
 
-def _methods_of(rows: Iterable[Row]) -> tuple[str, ...]:
+def _methods_of(rows: Iterable[EpisodeRow]) -> tuple[str, ...]:
     return tuple(sorted({row.policy for row in rows}))
 
 
-def _share(rows: Sequence[Row], goal: str) -> tuple[float, float, float]:
+def _share(rows: Sequence[EpisodeRow], goal: str) -> tuple[float, float, float]:
     reached = [step_of(row, goal) is not None for row in rows]
     return sum(reached) / len(rows), *share_interval(reached, list(map(scene_of, rows)))
 
 
-def _with(rows: Sequence[Row], objects: Sequence[int]) -> list[Row]:
+def _with(rows: Sequence[EpisodeRow], objects: Sequence[int]) -> list[EpisodeRow]:
     return [row for row in rows if not objects or row.objects in objects]
 
 

@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks.running.evaluate import Job
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, with_interval
 from mechsearch_jax.benchmarks.statistics.paired import reached_change, same_episodes, steps_change
 from mechsearch_jax.benchmarks.statistics.rates import Rates, summarise
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
 # What cells differ in. Differences are from the first value of each.
@@ -118,12 +118,12 @@ def _cell(setting: Setting, objects: int | None, rates: Rates, paper: Figures | 
     return Cell(setting, objects, rates.episodes, rates.errors, **means, paper=paper)
 
 
-def origin_of(row: Row) -> tuple[str | None, str | None]:
+def origin_of(row: EpisodeRow) -> tuple[str | None, str | None]:
     """The code and the simulator that an episode ran with."""
     return row.code, options_of(row).get("simulator")
 
 
-def ran_alike(rows: Sequence[Row], base: Sequence[Row]) -> bool:
+def ran_alike(rows: Sequence[EpisodeRow], base: Sequence[EpisodeRow]) -> bool:
     """Whether two settings differ in nothing but themselves: not in the code or the simulator, too."""
     return origin_of(rows[0]) == origin_of(base[0])
 
@@ -132,7 +132,7 @@ class Results(NamedTuple):
     """The rows of an experiment by what they ran with; those of a setting have their code and simulator in common."""
 
     table: PaperTable
-    rows: Mapping[Setting, Sequence[Row]]
+    rows: Mapping[Setting, Sequence[EpisodeRow]]
 
     def counts(self) -> list[int | None]:
         """The numbers of objects in the rows, and None for all of them if there are several."""
@@ -174,7 +174,7 @@ class Results(NamedTuple):
 
 
 def _difference(
-    factor: str, setting: Setting, base: Setting, objects: int | None, pairs: Sequence[tuple[Row, Row]]
+    factor: str, setting: Setting, base: Setting, objects: int | None, pairs: Sequence[tuple[EpisodeRow, EpisodeRow]]
 ) -> Difference:
     means = {}
     for name, goal in GOALS.items():
@@ -183,7 +183,7 @@ def _difference(
     return Difference(factor, setting, getattr(base, factor), objects, len(pairs), **means)
 
 
-def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: Mapping[str, Row]) -> Results:
+def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: Mapping[str, EpisodeRow]) -> Results:
     """The rows of the jobs that have one.
 
     Args:

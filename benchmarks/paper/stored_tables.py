@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
     origin_of,
 )
 from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
-from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, episode_key
+from mechsearch_jax.benchmarks.store.rows import OPTIONS, EpisodeRow, episode_key
 from mechsearch_jax.benchmarks.store.runs import StoredRun, variant_of
 from mechsearch_jax.envs.scenes.scene_sets import find_scene
 
@@ -53,9 +53,9 @@ def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
     Of every setting those of the newest run that has it, with its code and the simulator that most of them ran in. A
     former default is left out where a later one has the cell.
     """
-    rows: dict[Setting, dict[str, Row]] = {}
+    rows: dict[Setting, dict[str, EpisodeRow]] = {}
     for run in runs_of(table, runs):
-        fresh: dict[Setting, list[Row]] = {}
+        fresh: dict[Setting, list[EpisodeRow]] = {}
         for setting, row in _rows_of(table, run):
             fresh.setdefault(setting, []).append(row)
         for setting, own in fresh.items():
@@ -74,7 +74,7 @@ def _is_outdated(setting: Setting, settings: Collection[Setting]) -> bool:
     return any(setting._replace(preset=preset) in settings for preset in later)
 
 
-def _rows_of(table: PaperTable, run: StoredRun) -> list[tuple[Setting, Row]]:
+def _rows_of(table: PaperTable, run: StoredRun) -> list[tuple[Setting, EpisodeRow]]:
     settings = {line["variant"]: setting for line in run.lines if (setting := setting_of(line))}
     options, blocks = operator.attrgetter("configuration", *OPTIONS), set(table.blocks.values())
     variants: dict[Any, str] = {}

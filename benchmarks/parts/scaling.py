@@ -32,7 +32,7 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, evaluate
 from mechsearch_jax.benchmarks.running.processes import Processes, run_job
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
@@ -65,7 +65,7 @@ class Measured:
         have nothing left to do [s].
       cpu_seconds: mean CPU time of an episode in its worker, of all threads [s]; None on GPUs.
       steps: mean number of actions of an episode.
-      code, device, versions: as in `Row`.
+      code, device, versions: as in `EpisodeRow`.
       command: that was typed.
     """
 
@@ -96,7 +96,7 @@ def _measured(
     case: Case,
     workers: int,
     share: int,
-    rows: Sequence[Row],
+    rows: Sequence[EpisodeRow],
     command: str,
     episodes: int,
     seconds: tuple[float, float, float | None],
@@ -146,7 +146,7 @@ class _Spell:
     cpu: float
 
 
-def run_timed(folder: str, job: Job) -> Row:
+def run_timed(folder: str, job: Job) -> EpisodeRow:
     """`run_job` in a worker, which adds when that was to a file of its own in a folder."""
     begun, used = time.monotonic(), time.process_time()
     row = run_job(job)
@@ -269,7 +269,7 @@ def _running(commands: Sequence[tuple[list[str], dict]], log: Path) -> Iterator[
 
 def _times_of_rows(
     commands: Sequence[tuple[list[str], dict]], folder: Path, enough: int, progress: Progress
-) -> tuple[list[Row], list[float]]:
+) -> tuple[list[EpisodeRow], list[float]]:
     """The rows of commands, and when each was there by `time.monotonic`, until there are enough of them.
 
     Raises:

@@ -64,7 +64,7 @@ def weights_in_order(by_object: Float[Array, " n"]) -> Float[Array, " n"]:
 def occlusion_weights(
     problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
 ) -> Float[Array, " n"]:
-    """The `Weigh` of this baseline: most draws go to the object that occludes most and can be moved."""
+    """The `ObjectWeights` of this baseline: most draws go to the object that occludes most and can be moved."""
     return weights_in_order(occlusion(problem, belief, state).by_object)
 
 

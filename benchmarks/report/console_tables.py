@@ -17,7 +17,7 @@ from mechsearch_jax.benchmarks.parts.bench import Timing
 from mechsearch_jax.benchmarks.parts.recognition import SHARES, Measured
 from mechsearch_jax.benchmarks.reach import reach
 from mechsearch_jax.benchmarks.running.evaluate import Tally
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.scenes import scene_sets
 
 
@@ -242,7 +242,7 @@ def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, 
     return table
 
 
-def scenes_table(rows: Sequence[scenes.Row]) -> Group:
+def scenes_table(rows: Sequence[scenes.EpisodeRow]) -> Group:
     """What scenes are like: a row for each source and number of objects."""
     table = plain_table("scenes at their start")
     table.add_column("source", no_wrap=True)
@@ -275,7 +275,7 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
     return Group(table, Text(explanation, style="dim"), *map(Text, beside_exact))
 
 
-def reach_table(rows: Sequence[reach.Row]) -> Group:
+def reach_table(rows: Sequence[reach.EpisodeRow]) -> Group:
     """Where a target alone on the shelf can be grasped: a row for each band across it."""
     table = plain_table("grasps of a target alone on the shelf, from its right wall to its left one")
     for name in ("y [m]", "poses", "graspable", "hand", "reached", "feasible", "approaches"):
@@ -354,7 +354,7 @@ class EpisodeProgress:
         self._waited = True
         self._bar.update(self._task, stage=f"other processes run the rest ({episodes})")
 
-    def ended(self, row: Row, tally: Tally) -> None:
+    def ended(self, row: EpisodeRow, tally: Tally) -> None:
         """Take note of one more episode, of this process or another, and of what is known of all that are wanted."""
         counts = {"found": tally.found, "graspable": tally.graspable, "retrieved": tally.retrieved}
         rates = "  ".join(f"{name} {count / tally.ended:.2f}" for name, count in counts.items())

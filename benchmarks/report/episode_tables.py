@@ -17,10 +17,10 @@ from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, 
 from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
 
-def print_rates(console: Console, rows: Sequence[Row]) -> None:
+def print_rates(console: Console, rows: Sequence[EpisodeRow]) -> None:
     """Print the rates of rows by variant and number of objects, with what the labels stand for."""
     print_summary(console, summarise(rows), Key.of(rows))
 
@@ -37,7 +37,7 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
         console.print(f"all {key.common}", style="dim", soft_wrap=True)
 
 
-def rates_table(rows: Sequence[Row]) -> Table:
+def rates_table(rows: Sequence[EpisodeRow]) -> Table:
     """Rates of success by variant and number of objects; see `summary_table`."""
     return summary_table(summarise(rows), Key.of(rows))
 
@@ -120,7 +120,7 @@ def differences_table(differences: VariantDifferences, key: Key, baseline: str) 
     return table
 
 
-def events_table(rows: Sequence[Row]) -> Table | None:
+def events_table(rows: Sequence[EpisodeRow]) -> Table | None:
     """What happened on the way, by variant and number of objects; None where no row says it."""
     summary = summarise_events(rows)
     return events_summary_table(summary, Key.of(rows)) if summary else None
@@ -143,7 +143,7 @@ def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
     return table
 
 
-def ceiling_table(rows: Sequence[solvability.Row]) -> Group:
+def ceiling_table(rows: Sequence[solvability.EpisodeRow]) -> Group:
     """What share of scenes can be solved: a row for each number of objects; and below it why the others were not."""
     table = plain_table("scenes that can be solved at all")
     for name in ("objects", "scenes", "in an episode", "by the search", "solvable", "95% interval"):

@@ -11,7 +11,7 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.variants import label_variants
-from mechsearch_jax.benchmarks.store.rows import Row, episode_key, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key, options_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.workspace.scenario import Scenario
@@ -38,7 +38,7 @@ class Film:
       has_page: whether there is a page of it.
     """
 
-    row: Row
+    row: EpisodeRow
     method: str
     why: str
     caption: str
@@ -61,25 +61,25 @@ class Film:
         return f"{FOLDER}/{episode_key(self.row)}.html"
 
 
-def chosen(rows: Sequence[Row]) -> list[tuple[str, Row]]:
+def chosen(rows: Sequence[EpisodeRow]) -> list[tuple[str, EpisodeRow]]:
     """Episodes worth a look, and why: typical ones, lost ones for different reasons, and the slowest.
 
     The same ones for the same rows, in whatever order.
     """
     ended = [row for row in rows if not row.is_error]
     won = [row for row in ended if row.retrieved]
-    episodes: list[tuple[str, Row]] = []
+    episodes: list[tuple[str, EpisodeRow]] = []
     if won:
         usual = statistics.median_low(row.steps for row in won)
         episodes += [(TYPICAL, row) for row in sorted((r for r in won if r.steps == usual), key=episode_key)[:EACH]]
-    reasons: dict[str, list[Row]] = {}
+    reasons: dict[str, list[EpisodeRow]] = {}
     for row in ended:
         if not row.retrieved:
             reasons.setdefault(_reason(row), []).append(row)
     ranked = sorted(reasons.values(), key=lambda group: (-len(group), _reason(group[0])))
     # One of each reason, then a second one of each, and so on.
     turns = collections.deque(sorted(group, key=episode_key)[:EACH] for group in ranked)
-    lost: list[Row] = []
+    lost: list[EpisodeRow] = []
     while turns and len(lost) < EACH:
         group = turns.popleft()
         lost.append(group[0])
@@ -90,23 +90,23 @@ def chosen(rows: Sequence[Row]) -> list[tuple[str, Row]]:
     return [*episodes, *((SLOWEST, row) for row in slow[:EACH])]
 
 
-def _reason(row: Row) -> str:
+def _reason(row: EpisodeRow) -> str:
     return (row.failure or "unknown").partition(" at action ")[0]
 
 
-def _seconds(row: Row) -> float:
+def _seconds(row: EpisodeRow) -> float:
     return row.planning_seconds + row.simulation_seconds
 
 
-def _caption(row: Row) -> str:
+def _caption(row: EpisodeRow) -> str:
     ended = "retrieved" if row.retrieved else row.failure or "not retrieved"
     return f"{row.scenario}: {ended}, {row.steps} actions, {_seconds(row):.1f} s"
 
 
-Draw = Callable[[Row, Path], str]
+Draw = Callable[[EpisodeRow, Path], str]
 
 
-def films(rows: Sequence[Row], out: PathLike, draw: Draw | None = None) -> list[Film]:
+def films(rows: Sequence[EpisodeRow], out: PathLike, draw: Draw | None = None) -> list[Film]:
     """The episodes that a report shows, with the pictures that are there or can be drawn.
 
     Args:
@@ -158,7 +158,7 @@ class Frames:
         self._note(moment, self.frames[-1])
 
 
-def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
+def replay(row: EpisodeRow, scenario: Scenario, file: PathLike) -> str:
     """Run an episode again in the native simulator, draw its filmstrip, and write its page beside that.
 
     Returns:
@@ -167,7 +167,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     Raises:
       InputError: its options cannot be used today, the scenario holds something else, or the file cannot be written.
     """
-    from mechsearch_jax.benchmarks.running.in_turn import run_settings
+    from mechsearch_jax.benchmarks.running.sequential import run_settings
     from mechsearch_jax.envs.episode.closed_loop import Start
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.episode.method import Method
@@ -200,7 +200,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
     save_page(recorder.recording(problem, verdict(episode), episode), Path(file).with_suffix(".html"))
-    again = Row.of_episode(episode)
+    again = EpisodeRow.of_episode(episode)
     if all(getattr(row, name) == getattr(again, name) for name in _END):
         return ""
     simulator = options_of(row).get("simulator")

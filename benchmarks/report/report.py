@@ -13,7 +13,7 @@ from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, 
 from mechsearch_jax.benchmarks.statistics.paired import PAIRED, VariantDifferences, paired
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import Row, identity
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, identity
 from mechsearch_jax.benchmarks.store.shards import result_tables
 from mechsearch_jax.envs.scenes.scene_sets import CHOSEN_ON, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
@@ -23,13 +23,13 @@ from mechsearch_jax.runtime.files import PathLike
 _WHICH_ACTION = re.compile(r" at action \d+$")
 
 
-def read_tables(paths: Sequence[PathLike]) -> list[Row]:
+def read_tables(paths: Sequence[PathLike]) -> list[EpisodeRow]:
     """The rows of several results of `evaluate`: folders, folders of them, and Parquet files.
 
     Raises:
       InputError: one holds no such results, an episode is in two tables, or there is none at all.
     """
-    rows: list[Row] = []
+    rows: list[EpisodeRow] = []
     origin: dict[tuple, PathLike] = {}
     for path in paths:
         for table, members in result_tables(path):
@@ -45,7 +45,7 @@ def read_tables(paths: Sequence[PathLike]) -> list[Row]:
     return rows
 
 
-def changed_scenarios(rows: Sequence[Row]) -> list[str]:
+def changed_scenarios(rows: Sequence[EpisodeRow]) -> list[str]:
     """Names under which rows hold more than one content: their files were changed in between."""
     contents: dict[str, set[str]] = {}
     for row in rows:
@@ -53,7 +53,7 @@ def changed_scenarios(rows: Sequence[Row]) -> list[str]:
     return sorted(name for name, hashes in contents.items() if len(hashes) > 1)
 
 
-def changed_scenarios_remark(rows: Sequence[Row]) -> str:
+def changed_scenarios_remark(rows: Sequence[EpisodeRow]) -> str:
     """A sentence that names scenarios that changed between rows; empty if there are none."""
     names = changed_scenarios(rows)
     if not names:
@@ -62,7 +62,7 @@ def changed_scenarios_remark(rows: Sequence[Row]) -> str:
     return f"Scenarios whose content is not the same in all rows count as several: {', '.join(names[:5])}{more}."
 
 
-def chosen_scenes_remark(rows: Sequence[Row]) -> str:
+def chosen_scenes_remark(rows: Sequence[EpisodeRow]) -> str:
     """A sentence that says how many episodes are on scenes that settings were chosen on; empty if none is."""
     count = sum(is_chosen_on(row.scenario) for row in rows)
     if not count:
@@ -88,14 +88,14 @@ class Failures:
     share: float
 
 
-def failure_reason(row: Row) -> str:
+def failure_reason(row: EpisodeRow) -> str:
     """Why an episode ended without a retrieval, whichever action it was."""
     return _WHICH_ACTION.sub("", row.failure or "unknown")
 
 
-def failures(rows: Sequence[Row]) -> list[Failures]:
+def failures(rows: Sequence[EpisodeRow]) -> list[Failures]:
     """Why episodes ended without a retrieval, the most frequent reason first."""
-    groups: dict[str, list[Row]] = {}
+    groups: dict[str, list[EpisodeRow]] = {}
     for row, label in zip(rows, label_variants(rows), strict=True):
         groups.setdefault(label, []).append(row)
     table = []
@@ -141,7 +141,7 @@ class Report:
       drawn: the files of all single episodes that are drawn; see `scene_map.drawn_files`.
     """
 
-    episodes: Sequence[Row]
+    episodes: Sequence[EpisodeRow]
     key: Key
     rates: Sequence[Rates]
     variants: Sequence[Rates]
@@ -156,7 +156,7 @@ class Report:
     drawn: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, rows: Sequence[Row], options: ReportOptions | None = None) -> Report:
+    def of(cls, rows: Sequence[EpisodeRow], options: ReportOptions | None = None) -> Report:
         """The report of at least one row.
 
         Raises:

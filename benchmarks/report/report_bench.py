@@ -19,7 +19,7 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.running.evaluate import present_code
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import ROWS_PER_SHARD, ShardWriter
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
@@ -44,7 +44,7 @@ REPORTS: Mapping[str, tuple[str, ...]] = {
 MEBIBYTE = 2**20
 
 
-def drawn_rows(count: int, seed: int = 0) -> list[Row]:
+def drawn_rows(count: int, seed: int = 0) -> list[EpisodeRow]:
     """Rows as `sweep` leaves them, of episodes that are drawn at random and never run.
 
     Each scene has a difficulty of its own and each variant a skill, so that the episodes of a scene are alike.
@@ -64,7 +64,7 @@ def drawn_rows(count: int, seed: int = 0) -> list[Row]:
     ]
 
 
-def _plain_rows() -> list[Row]:
+def _plain_rows() -> list[EpisodeRow]:
     """A row of each variant, whose episode and scene are to be filled in."""
     scenario = load_scenario(next(iter(example_scenarios().values())))
     device = versions()["device"]
@@ -72,12 +72,12 @@ def _plain_rows() -> list[Row]:
     for values in itertools.product(*SWEPT.values()):
         method = Method(config=PRESETS["standard"](**dict(zip(SWEPT, values, strict=True))))
         options = {**method.options(), "target": "cylinder", "simulator": method.engine, "seed": 0}
-        row = Row.failed(scenario, options, "", present_code())
+        row = EpisodeRow.failed(scenario, options, "", present_code())
         rows.append(dataclasses.replace(row, device=device, versions="{}", compile_seconds=0.0))
     return rows
 
 
-def _drawn_row(draws: np.random.Generator, plain: Row, scene: int, seed: int, chance: float) -> Row:
+def _drawn_row(draws: np.random.Generator, plain: EpisodeRow, scene: int, seed: int, chance: float) -> EpisodeRow:
     """The row of an episode that reaches each goal after the one before with a chance, some actions later."""
     reached = int(np.argmin([*(draws.random(len(FAILURES)) < chance ** (1 / len(FAILURES))), False]))
     after = np.minimum(np.cumsum(draws.integers(1, 4, len(FAILURES))), MOST_STEPS).tolist()

@@ -17,7 +17,7 @@ from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, Rates, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.drawing import INK, MUTED
 
@@ -37,7 +37,7 @@ def _plain(axes: Axes) -> None:
     axes.tick_params(colors=INK, labelsize=8)
 
 
-def _curve(axes: Axes, rows: Sequence[Row], goal: str, actions: int, colour: str, label: str) -> None:
+def _curve(axes: Axes, rows: Sequence[EpisodeRow], goal: str, actions: int, colour: str, label: str) -> None:
     counts = reached(rows, goal, actions)
     x, after, scenes = np.arange(actions + 1), [step_of(row, goal) for row in rows], list(map(scene_of, rows))
     low, high = np.array(
@@ -47,7 +47,7 @@ def _curve(axes: Axes, rows: Sequence[Row], goal: str, actions: int, colour: str
     axes.plot(x, np.array(counts) / len(rows), color=colour, marker="o", markersize=3, label=label)
 
 
-def shown_variants(rows: Sequence[Row], key: Key, baseline: str | None = None) -> dict[str, str]:
+def shown_variants(rows: Sequence[EpisodeRow], key: Key, baseline: str | None = None) -> dict[str, str]:
     """Variants that are drawn in colour, with their label in the legend: all, or if they are too many, the baseline,
     the best and the worst."""
     if len(key.short) <= len(COLOURS):
@@ -62,13 +62,13 @@ def shown_variants(rows: Sequence[Row], key: Key, baseline: str | None = None) -
     return {label: named[label] for label in dict.fromkeys(chosen)}
 
 
-def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
+def success_figure(rows: Sequence[EpisodeRow], baseline: str | None = None) -> Figure:
     """Share of episodes that reached each goal over the number of actions: a column for each number of objects.
 
     Where these are several, a last column has all of them together.
     """
     key = Key.of(rows)
-    groups: dict[tuple[str, int], list[Row]] = {}
+    groups: dict[tuple[str, int], list[EpisodeRow]] = {}
     for row, label in zip(rows, label_variants(rows), strict=True):
         groups.setdefault((label, row.objects), []).append(row)
     shown, objects = shown_variants(rows, key, baseline), sorted({objects for _, objects in groups})
@@ -104,9 +104,9 @@ def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
     return figure
 
 
-def _curves(groups: Mapping[tuple[str, int], Sequence[Row]], objects: int | None) -> dict[str, list[Row]]:
+def _curves(groups: Mapping[tuple[str, int], Sequence[EpisodeRow]], objects: int | None) -> dict[str, list[EpisodeRow]]:
     """The rows of each variant with so many objects, by its label; all rows if None."""
-    curves: dict[str, list[Row]] = {}
+    curves: dict[str, list[EpisodeRow]] = {}
     for (label, count), rows in groups.items():
         if objects in (None, count):
             curves.setdefault(label, []).extend(rows)
@@ -156,7 +156,7 @@ def _drawn(rates: Sequence[Rates], goal: str) -> np.ndarray:
     return np.array(shares).T
 
 
-def curve_rates(rows: Sequence[Row], columns: Sequence[str]) -> list[Rates]:
+def curve_rates(rows: Sequence[EpisodeRow], columns: Sequence[str]) -> list[Rates]:
     """Rates over the first column, for each value of the second one, if there are two.
 
     Raises:

@@ -19,7 +19,7 @@ from mechsearch_jax.benchmarks.report.scene_map import scene_records
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT, label_variants
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import save_figure
 
@@ -124,7 +124,7 @@ def _pictures(report: Report) -> dict[str, Callable[[], Figure]]:
 
 
 def write_report(
-    rows: Sequence[Row] | Report, out: PathLike, progress: Callable[[str], None] = lambda file: None
+    rows: Sequence[EpisodeRow] | Report, out: PathLike, progress: Callable[[str], None] = lambda file: None
 ) -> None:
     """Write a report, the files `FILES` and those of `OPTIONAL_FILES` that it has, into a folder.
 

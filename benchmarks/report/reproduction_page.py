@@ -33,7 +33,7 @@ from mechsearch_jax.benchmarks.statistics.intervals import with_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes, steps_change
 from mechsearch_jax.benchmarks.statistics.rates import scene_of
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.scenes.scene_sets import CHOSEN_ON, is_chosen_on
 from mechsearch_jax.runtime.files import PathLike
@@ -108,7 +108,7 @@ def scenes_table(tables: Mapping[str, Results]) -> str:
 
 def parts_of(results: Results) -> dict[str, Results]:
     """The rows of a table by what the cells of a part have in common."""
-    parts: dict[str, dict[Setting, Sequence[Row]]] = {}
+    parts: dict[str, dict[Setting, Sequence[EpisodeRow]]] = {}
     for setting, rows in results.rows.items():
         parts.setdefault(setting.part, {})[setting] = rows
     return {part: Results(results.table, rows) for part, rows in parts.items()}
@@ -130,7 +130,7 @@ def _cell(setting: Setting, objects: int | None) -> tuple[str, ...]:
     return setting.recognition, setting.method, actions_text(setting), objects_text(objects)
 
 
-def _grasp(setting: Setting, rows: Sequence[Row], value: float | None) -> str:
+def _grasp(setting: Setting, rows: Sequence[EpisodeRow], value: float | None) -> str:
     """A figure of the paper's grasps, "-" beside cells whose graspable is not the paper's."""
     return _paper(value) if goal_of("grasp", setting, rows[0]) == "graspable" else "-"
 

@@ -19,7 +19,7 @@ from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
 from mechsearch_jax.runtime.files import PathLike
@@ -171,20 +171,20 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
-def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[Row]:
+def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[EpisodeRow]:
     """The rows with such settings on scenes that nothing was chosen on; a later option was as it is usually."""
     wanted = Settings(preset, differing)
     rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
     return [row for row in rows if settings_of(options_of(row)) == wanted]
 
 
-def _named(label: str, rows: Sequence[Row]) -> dict[str, list[Episode]]:
+def _named(label: str, rows: Sequence[EpisodeRow]) -> dict[str, list[Episode]]:
     """Rows as episodes, by a label that says with how many seeds where there are several."""
     seeds = len({row.seed for row in rows})
     return {f"{label}, {seeds} seeds" if seeds > 1 else label: [vars(row) for row in rows]}
 
 
-def _change(after: Sequence[Row], before: Sequence[Row]) -> dict[str, Any]:
+def _change(after: Sequence[EpisodeRow], before: Sequence[EpisodeRow]) -> dict[str, Any]:
     """How many points more are retrieved than in the same episodes of other rows, in words: `pairs`, `all` with its 95%
     interval, and `each` by number of objects."""
     pairs = same_episodes(after, before)

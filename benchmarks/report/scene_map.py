@@ -9,7 +9,7 @@ from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Mark, Matrix, 
 from mechsearch_jax.benchmarks.report.films import FOLDER
 from mechsearch_jax.benchmarks.statistics.by_scene import ENDS, SceneResults, by_scene, end_of
 from mechsearch_jax.benchmarks.statistics.variants import Key
-from mechsearch_jax.benchmarks.store.rows import Row, episode_key
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key
 from mechsearch_jax.runtime.files import PathLike
 
 # Of several seeds, where some retrieved the target and others did not.
@@ -30,7 +30,7 @@ def drawn_files(out: PathLike) -> frozenset[str]:
     return frozenset(file.name for file in (Path(out) / FOLDER).glob("*.*"))
 
 
-def scene_map(rows: Sequence[Row], key: Key, drawn: frozenset[str] = frozenset()) -> list[Block]:
+def scene_map(rows: Sequence[EpisodeRow], key: Key, drawn: frozenset[str] = frozenset()) -> list[Block]:
     """The map of scenes and variants.
 
     Args:
@@ -80,13 +80,13 @@ def _mark(scene: SceneResults, label: str, drawn: frozenset[str]) -> Mark | None
     return Mark(kind, text, COLOURS[kind], next((file for file in files if file), ""))
 
 
-def _drawn(row: Row, drawn: frozenset[str]) -> str:
+def _drawn(row: EpisodeRow, drawn: frozenset[str]) -> str:
     """The page of an episode, or else its filmstrip; empty if neither is there."""
     names = (f"{episode_key(row)}.{ending}" for ending in ("html", "png"))
     return next((f"{FOLDER}/{name}" for name in names if name in drawn), "")
 
 
-def scene_records(rows: Sequence[Row], key: Key) -> list[dict[str, object]]:
+def scene_records(rows: Sequence[EpisodeRow], key: Key) -> list[dict[str, object]]:
     """A line for each scene: its difficulty, and of each variant how many episodes retrieved the target."""
     return [
         {

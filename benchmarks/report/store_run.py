@@ -17,13 +17,13 @@ from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.rates import mean_actions, scene_of
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, merged, started, variant_of, write_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
 
 
-def rates_of(rows: Sequence[Row]) -> dict[str, Any]:
+def rates_of(rows: Sequence[EpisodeRow]) -> dict[str, Any]:
     """For each of `OUTCOMES` its share and 95% interval, by scene, or None; and `mean_actions`."""
     rates: dict[str, Any] = {}
     for name, outcome in OUTCOMES.items():
@@ -47,7 +47,7 @@ def scene_set_of(scenario: str) -> str:
     return next(name for name, scene_set in SETS.items() if scene[0] in scene_set.blocks)
 
 
-def line_of(rows: Sequence[Row], scene_set: str) -> dict[str, Any]:
+def line_of(rows: Sequence[EpisodeRow], scene_set: str) -> dict[str, Any]:
     """What comes of the rows of a variant on the scenes of a set with the same number of objects."""
     settings, unchosen = settings_of(options_of(rows[0])), [row for row in rows if not is_chosen_on(row.scenario)]
     chosen_on = {row.scenario for row in rows} - {row.scenario for row in unchosen}
@@ -68,7 +68,7 @@ def line_of(rows: Sequence[Row], scene_set: str) -> dict[str, Any]:
     }
 
 
-def run_of(name: str, rows: Sequence[Row], **origin: Any) -> StoredRun:
+def run_of(name: str, rows: Sequence[EpisodeRow], **origin: Any) -> StoredRun:
     """The run of rows.
 
     Args:
@@ -76,7 +76,7 @@ def run_of(name: str, rows: Sequence[Row], **origin: Any) -> StoredRun:
       rows: of the same code.
       **origin: what every line says beside the run's name, code and devices, such as its command.
     """
-    groups: dict[tuple[str, str, int], list[Row]] = {}
+    groups: dict[tuple[str, str, int], list[EpisodeRow]] = {}
     for row in rows:
         groups.setdefault((scene_set_of(row.scenario), variant_of(row), row.objects), []).append(row)
     devices = sorted({row.device for row in rows if row.device})

@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 import jax
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, in_a_line, present_code
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -75,7 +75,7 @@ class Batches:
     again: Callable[[str], None] = lambda text: None
 
     def __call__(
-        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[EpisodeRow]], None], begin: Callable[[Job], bool]
     ) -> None:
         """Run all jobs; see `evaluate.Runner`.
 
@@ -137,7 +137,7 @@ class Batches:
                         self.again(f"{count} episodes are run again in halves, because of {in_a_line(error)}")
                         batches += batch.halves()
 
-    def _run(self, batch: _Batch, ended: Callable[[Sequence[Row]], None], means: _Means) -> None:
+    def _run(self, batch: _Batch, ended: Callable[[Sequence[EpisodeRow]], None], means: _Means) -> None:
         code, method, target = present_code(), means.method, means.target
         policy_of, options_of = functools.cache(Method.policy), functools.cache(Method.options)
 
@@ -147,7 +147,7 @@ class Batches:
 
         def take(episodes: Sequence[tuple[int, Episode]]) -> None:
             if counted := batch.take(episodes):
-                ended([Row.of_episode(episode, code) for episode in counted])
+                ended([EpisodeRow.of_episode(episode, code) for episode in counted])
 
         run_episodes(
             map(start, batch.jobs(means.worlds)),
@@ -233,12 +233,12 @@ class _Batch:
 class _Failures:
     """Episodes that failed alone, until it is known whether it is they that are bad, or everything."""
 
-    def __init__(self, ended: Callable[[Sequence[Row]], None]) -> None:
+    def __init__(self, ended: Callable[[Sequence[EpisodeRow]], None]) -> None:
         self._ended = ended
         self._any_ended = False
-        self._waiting: list[Row] = []
+        self._waiting: list[EpisodeRow] = []
 
-    def ended(self, rows: Sequence[Row]) -> None:
+    def ended(self, rows: Sequence[EpisodeRow]) -> None:
         """Hand on the rows of episodes that ended, after those of the ones that failed."""
         self._any_ended = True
         self.hand_on()
@@ -265,10 +265,11 @@ class _Failures:
 
 def groups(jobs: Sequence[Job]) -> list[tuple[Target, list[Job]]]:
     """The jobs by what is compiled for them, with their target."""
-    mould = functools.cache(Method.mould)
+    compile_key = functools.cache(Method.compile_key)
     groups: dict[tuple[Target, Hashable], list[Job]] = {}
     for job in jobs:
-        groups.setdefault((target_of(job.scenario, job.method.workcell.target), mould(job.method)), []).append(job)
+        key = target_of(job.scenario, job.method.workcell.target), compile_key(job.method)
+        groups.setdefault(key, []).append(job)
     return [(target, group) for (target, _), group in groups.items()]
 
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from mechsearch_jax.benchmarks.running.cluster_workers import Kind, Place, Worker
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.store.rows import Row, episode_key
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 
@@ -147,7 +147,7 @@ class RayCluster:
     address: str = LOCAL
 
     def __call__(
-        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[EpisodeRow]], None], begin: Callable[[Job], bool]
     ) -> None:
         """Run all jobs; see `evaluate.Runner`.
 
@@ -173,7 +173,7 @@ class _Run:
         kind: Kind,
         place: Place,
         chunks: Sequence[Sequence[Job]],
-        ended: Callable[[Sequence[Row]], None],
+        ended: Callable[[Sequence[EpisodeRow]], None],
         begin: Callable[[Job], bool],
     ) -> None:
         self._ray = import_ray()
@@ -239,7 +239,7 @@ class _Run:
         """
         errors = self._ray.exceptions
         try:
-            rows: Sequence[Row] = self._ray.get(next(stream))
+            rows: Sequence[EpisodeRow] = self._ray.get(next(stream))
         except StopIteration:
             self._idle.append(worker.actor)
             return

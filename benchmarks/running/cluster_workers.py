@@ -17,9 +17,9 @@ import jax
 
 from mechsearch_jax.benchmarks.running.batches import MOST_WORLDS, Batches, groups
 from mechsearch_jax.benchmarks.running.evaluate import Job, Runner, present_code
-from mechsearch_jax.benchmarks.running.in_turn import InTurn
 from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, TIME_LIMIT
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.problem.cache import keep_compilations
 from mechsearch_jax.runtime.cores import VARIABLE
 from mechsearch_jax.runtime.errors import InputError
@@ -95,7 +95,7 @@ class OnCpus:
 
     def runner(self) -> Runner:
         """See `Kind`."""
-        return InTurn()
+        return SequentialRunner()
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,13 @@ class Worker:
         keep_compilations()
         self._runner = kind.runner()
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Sequence[Row]]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[Sequence[EpisodeRow]]:
         """Run jobs that have been begun; their rows, as they end.
 
         Raises:
           Exception: whatever the runner failed with.
         """
-        ended: queue.SimpleQueue[Sequence[Row] | BaseException | None] = queue.SimpleQueue()
+        ended: queue.SimpleQueue[Sequence[EpisodeRow] | BaseException | None] = queue.SimpleQueue()
 
         def work() -> None:
             try:

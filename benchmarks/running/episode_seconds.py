@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD, settings_of
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.simulators.named import EngineName
@@ -100,7 +100,7 @@ class StoredSeconds:
 
 
 def kind_of(options: Mapping[str, Any] | str) -> Kind:
-    """The kind of the episodes of a method's options with its simulator, or of a `Row.configuration`."""
+    """The kind of the episodes of a method's options with its simulator, or of a `EpisodeRow.configuration`."""
     return _kind_of(options if isinstance(options, str) else json.dumps(options, sort_keys=True))
 
 
@@ -112,7 +112,7 @@ def _kind_of(configuration: str) -> Kind:
     return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials, simulator)
 
 
-def measured(rows: Sequence[Row], compilations: int, at_once: int = 1) -> Measured:
+def measured(rows: Sequence[EpisodeRow], compilations: int, at_once: int = 1) -> Measured:
     """Mean seconds of an episode, and of a compilation if as many processes waited for each at once."""
     running = sum(row.planning_seconds + row.simulation_seconds for row in rows) / len(rows)
     return Measured(running, sum(row.compile_seconds or 0.0 for row in rows) / compilations / at_once, len(rows))
@@ -152,7 +152,7 @@ def nearest(device: str, kind: Kind, stored: Sequence[StoredSeconds]) -> StoredS
 
 def seconds_of(run: StoredRun) -> list[StoredSeconds]:
     """What the episodes of a run took, by device and kind."""
-    groups: dict[tuple[str, Kind], list[Row]] = {}
+    groups: dict[tuple[str, Kind], list[EpisodeRow]] = {}
     for row in run.rows:
         if row.device and not row.is_error:
             groups.setdefault((row.device, kind_of(row.configuration)), []).append(row)

@@ -20,7 +20,7 @@ from mechsearch_jax.benchmarks.running.episode_seconds import (
 )
 from mechsearch_jax.benchmarks.running.evaluate import check_code
 from mechsearch_jax.benchmarks.running.planned import PlannedJob
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.method import MISMATCH_PREFIX, Method
 from mechsearch_jax.envs.world.mismatch import Mismatch
@@ -132,27 +132,27 @@ def estimate(jobs: Sequence[PlannedJob], out: PathLike, workers: int | None, ret
     for job in left:
         by_kind.setdefault(kinds(job.method), []).append(job)
     clocks = _Clocks(rows, device, workers or 1)
-    mould = functools.cache(Method.mould)
+    compile_key = functools.cache(Method.compile_key)
     seen: set[object] = set()
     parts = []
     for kind, members in by_kind.items():
-        moulds = {(job.target, mould(job.method)) for job in members} - seen
-        seen |= moulds
-        parts.append(Part(kind, len(members), len(moulds), *clocks.of(kind)))
+        keys = {(job.target, compile_key(job.method)) for job in members} - seen
+        seen |= keys
+        parts.append(Part(kind, len(members), len(keys), *clocks.of(kind)))
     return Estimate(len({job.method for job in jobs}), len(wanted), len(wanted) - len(left), workers, parts)
 
 
 class _Clocks:
     """What episodes take: by a folder's rows, else by stored runs, else by what is assumed."""
 
-    def __init__(self, rows: Sequence[Row], device: str, at_once: int) -> None:
+    def __init__(self, rows: Sequence[EpisodeRow], device: str, at_once: int) -> None:
         """Args:
         rows: of the folder, of the device.
         device: as `versions` says it.
         at_once: how many processes wait for each compilation.
         """
         self._device, self._at_once = device, at_once
-        self._folder: dict[Kind, list[Row]] = {}
+        self._folder: dict[Kind, list[EpisodeRow]] = {}
         for row in rows:
             self._folder.setdefault(kind_of(row.configuration), []).append(row)
         self._stored = stored_seconds()
@@ -177,7 +177,7 @@ def _of(measured_kind: Kind, kind: Kind) -> str:
     return f", of {', '.join(differing)}" if differing else ""
 
 
-def _compilations(rows: Iterable[Row]) -> int:
+def _compilations(rows: Iterable[EpisodeRow]) -> int:
     """How many compilations rows needed, as far as their options tell."""
     return len({_discrete(row.configuration, row.target) for row in rows})
 
@@ -190,4 +190,4 @@ def _discrete(configuration: str, target: str) -> str:
     mismatch = Mismatch(**{name.removeprefix(MISMATCH_PREFIX): value for name, value in differs.items()})
     data = CONTINUOUS | differs.keys() | {"max_steps"}
     kept = {name: value for name, value in options.items() if name not in data}
-    return json.dumps([kept, mismatch.mould(), target], sort_keys=True)
+    return json.dumps([kept, mismatch.compile_key(), target], sort_keys=True)

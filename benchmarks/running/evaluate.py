@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from mechsearch_jax.benchmarks.running.planned import PlannedJob
 from mechsearch_jax.benchmarks.store.claims import Claims
-from mechsearch_jax.benchmarks.store.rows import Row, episode_key
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key
 from mechsearch_jax.benchmarks.store.shards import CLOSED_ENDING, Results, ShardWriter
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.runtime.errors import InputError
@@ -57,11 +57,11 @@ class Job:
         """The `episode_key` of its row."""
         return episode_key(self.failed(""))
 
-    def failed(self, reason: str) -> Row:
+    def failed(self, reason: str) -> EpisodeRow:
         """The row of an episode that could not be run to its end."""
-        return Row.failed(self.scenario, self.options, reason, present_code())
+        return EpisodeRow.failed(self.scenario, self.options, reason, present_code())
 
-    def failed_by(self, error: BaseException) -> Row:
+    def failed_by(self, error: BaseException) -> EpisodeRow:
         """The same, where an exception says why."""
         return self.failed(in_a_line(error))
 
@@ -150,7 +150,7 @@ class Tally:
     retrieved: int = 0
     errors: int = 0
 
-    def plus(self, row: Row) -> Tally:
+    def plus(self, row: EpisodeRow) -> Tally:
         """With one more episode."""
         return dataclasses.replace(
             self,
@@ -166,7 +166,7 @@ class Runner(Protocol):
     """Runs episodes in whatever order it likes."""
 
     def __call__(
-        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[EpisodeRow]], None], begin: Callable[[Job], bool]
     ) -> None:
         """Run all jobs that are still to be run.
 
@@ -183,10 +183,10 @@ def evaluate(
     jobs: Sequence[Job],
     out: PathLike,
     runner: Runner,
-    ended: Callable[[Row, Tally], None] = lambda row, tally: None,
+    ended: Callable[[EpisodeRow, Tally], None] = lambda row, tally: None,
     waiting: Callable[[int], None] = lambda episodes: None,
     retry_errors: bool = False,
-) -> list[Row]:
+) -> list[EpisodeRow]:
     """Run the jobs of which the folder at `out` holds no row yet, and add each as its episode ends.
 
     Any number of processes may do so at the same time, in the same folder and for the same jobs: each episode is run by
@@ -252,7 +252,7 @@ class _Work:
         results: Results,
         claims: Claims,
         writer: ShardWriter,
-        ended: Callable[[Row, Tally], None],
+        ended: Callable[[EpisodeRow, Tally], None],
         retry_errors: bool,
     ) -> None:
         """Args are as `evaluate` has them; `results` have not been read."""
@@ -276,7 +276,7 @@ class _Work:
             self._tally = self._tally.plus(results.rows[key])
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[EpisodeRow]:
         """The rows of all jobs; all must have ended."""
         return [self._results.rows[job.key] for job in self._jobs]
 
@@ -295,7 +295,7 @@ class _Work:
             return False
         return True
 
-    def take(self, rows: Sequence[Row]) -> None:
+    def take(self, rows: Sequence[EpisodeRow]) -> None:
         """Keep the rows of episodes that ended.
 
         Raises:

@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence, Sized
 from typing import Any
 
-from mechsearch_jax.benchmarks.store.rows import Row, episode_key
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import Block, recorded
 from mechsearch_jax.runtime.errors import InputError
@@ -63,7 +63,7 @@ class PlannedJob:
     def key(self) -> str:
         """The `episode_key` of its row."""
         options = {"target": self.scene.target.shape, "simulator": self.method.engine, "seed": self.seed}
-        return episode_key(Row.failed(self.scene, {**_options(self.method), **options}, ""))
+        return episode_key(EpisodeRow.failed(self.scene, {**_options(self.method), **options}, ""))
 
     @property
     def target(self) -> Target:

@@ -28,8 +28,8 @@ import loky.backend
 import pebble
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.running.in_turn import InTurn
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.problem.cache import keep_compilations
 from mechsearch_jax.runtime.cores import VARIABLE, share_of_cores
 from mechsearch_jax.runtime.errors import InputError
@@ -49,14 +49,14 @@ MOST_DEATHS = 3
 LOOK_EVERY = 1.0
 
 
-def run_job(job: Job) -> Row:
+def run_job(job: Job) -> EpisodeRow:
     """The row of a job, run in this process."""
     return _in_turn().row(job)
 
 
 @functools.cache
-def _in_turn() -> InTurn:
-    return InTurn()
+def _in_turn() -> SequentialRunner:
+    return SequentialRunner()
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,11 @@ class Processes:
 
     workers: int
     time_limit: float = TIME_LIMIT
-    run: Callable[[Job], Row] = run_job
+    run: Callable[[Job], EpisodeRow] = run_job
     cores: int | None = None
 
     def __call__(
-        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[EpisodeRow]], None], begin: Callable[[Job], bool]
     ) -> None:
         """Run all jobs; see `evaluate.Runner`.
 
@@ -96,7 +96,7 @@ class Processes:
                 return worker
 
             idle = [new_worker() for _ in range(count)]
-            running: dict[Future[Row], tuple[pebble.ProcessPool, Job]] = {}
+            running: dict[Future[EpisodeRow], tuple[pebble.ProcessPool, Job]] = {}
             while True:
                 while idle and (job := again.pop() if again else next(todo, None)):
                     worker = idle.pop()
@@ -121,7 +121,7 @@ class Processes:
                 if deaths >= MOST_DEATHS:
                     raise InputError(f"worker processes end while they start{_newest_line(Path(outputs))}")
 
-    def _row(self, job: Job, future: Future[Row], outputs: Path) -> Row:
+    def _row(self, job: Job, future: Future[EpisodeRow], outputs: Path) -> EpisodeRow:
         """The row of a job that is over."""
         try:
             return future.result()

@@ -23,11 +23,11 @@ from typing import Any
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_intervals
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, scene_of, step_of, with_totals
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.planner import PRESETS
 
 
-def budget_of(rows: Sequence[Row]) -> int:
+def budget_of(rows: Sequence[EpisodeRow]) -> int:
     """The number of actions that every episode may take: the least of their budgets.
 
     Args:
@@ -44,7 +44,7 @@ def horizon_of(goal: str, budget: int) -> int:
     return budget + (goal == "retrieved")
 
 
-def restricted_steps(row: Row, goal: str, budget: int) -> int:
+def restricted_steps(row: EpisodeRow, goal: str, budget: int) -> int:
     """Actions until a goal, at most as many as its horizon, which also stands for never.
 
     Args:
@@ -56,7 +56,7 @@ def restricted_steps(row: Row, goal: str, budget: int) -> int:
     return horizon if step is None else min(step, horizon)
 
 
-def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
+def reached(rows: Sequence[EpisodeRow], goal: str, actions: int) -> list[int]:
     """How many episodes had reached a goal after 0, 1, ..., `actions` actions: the cumulative incidence, as counts."""
     after = collections.Counter(step_of(row, goal) for row in rows)
     return list(itertools.accumulate(after[k] for k in range(actions + 1)))
@@ -91,7 +91,7 @@ class RestrictedMeans:
 
 
 def restricted_means(
-    rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects"), budget: int | None = None
+    rows: Sequence[EpisodeRow], columns: Sequence[str] = (VARIANT, "objects"), budget: int | None = None
 ) -> list[RestrictedMeans]:
     """Restricted means, grouped as `rates.summarise` does, all of them up to the same horizon.
 
@@ -116,6 +116,6 @@ def restricted_means(
     return means
 
 
-def _steps_and_scenes(rows: Sequence[Row], goal: str, budget: int) -> tuple[list[int], list[Hashable]]:
+def _steps_and_scenes(rows: Sequence[EpisodeRow], goal: str, budget: int) -> tuple[list[int], list[Hashable]]:
     """The restricted actions until a goal and the scene of each episode."""
     return [restricted_steps(row, goal, budget) for row in rows], [scene_of(row) for row in rows]

@@ -7,7 +7,7 @@ import operator
 from collections.abc import Mapping, Sequence
 
 from mechsearch_jax.benchmarks.statistics.variants import label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
 # How far an episode came, from the best end to the worst, in words.
 ENDS: Mapping[str, str] = {
@@ -19,7 +19,7 @@ ENDS: Mapping[str, str] = {
 }
 
 
-def end_of(row: Row) -> str:
+def end_of(row: EpisodeRow) -> str:
     """How far an episode came; one of `ENDS`."""
     if row.is_error:
         return "error"
@@ -42,10 +42,10 @@ class SceneResults:
 
     scenario: str
     objects: int
-    rows: Mapping[str, Sequence[Row]]
+    rows: Mapping[str, Sequence[EpisodeRow]]
 
     @property
-    def every(self) -> list[Row]:
+    def every(self) -> list[EpisodeRow]:
         """All its episodes."""
         return [row for rows in self.rows.values() for row in rows]
 
@@ -56,9 +56,9 @@ class SceneResults:
         return sum(shares) / len(shares)
 
 
-def by_scene(rows: Sequence[Row]) -> list[SceneResults]:
+def by_scene(rows: Sequence[EpisodeRow]) -> list[SceneResults]:
     """The scenes of rows, by their number of objects, and of each number the hardest first."""
-    scenes: dict[tuple[int, str, str | None], dict[str, list[Row]]] = {}
+    scenes: dict[tuple[int, str, str | None], dict[str, list[EpisodeRow]]] = {}
     for row, label in zip(rows, label_variants(rows), strict=True):
         scene = scenes.setdefault((row.objects, row.scenario, row.content_hash), {})
         scene.setdefault(label, []).append(row)

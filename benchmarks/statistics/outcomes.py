@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
 
-def _drop_free(row: Row) -> bool | None:
+def _drop_free(row: EpisodeRow) -> bool | None:
     return None if row.objects_fallen is None and not row.is_error else row.objects_fallen == 0
 
 
 # What an episode reaches, by what stored runs call it; None where a row does not say. An error reaches nothing.
-OUTCOMES: Mapping[str, Callable[[Row], bool | None]] = {
+OUTCOMES: Mapping[str, Callable[[EpisodeRow], bool | None]] = {
     "found": lambda row: row.found_step is not None,
     "graspable": lambda row: row.graspable_step is not None,
     "paper_graspable": lambda row: row.paper_graspable,

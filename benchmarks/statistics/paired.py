@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks.statistics.actions_until import budget_of, restri
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, by_scene, mean_interval
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, scene_of, step_of
 from mechsearch_jax.benchmarks.statistics.variants import canonical, column, label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.runtime.errors import InputError
 
 # What two episodes of a pair have in common by default.
@@ -68,7 +68,9 @@ class PairedDifference:
         return mean_interval(self.scene_means, range(self.scenes))
 
 
-def same_episodes(rows: Sequence[Row], base: Sequence[Row], objects: int | None = None) -> list[tuple[Row, Row]]:
+def same_episodes(
+    rows: Sequence[EpisodeRow], base: Sequence[EpisodeRow], objects: int | None = None
+) -> list[tuple[EpisodeRow, EpisodeRow]]:
     """The rows of which the base has one on the same scene with the same seed, each with that one.
 
     Args:
@@ -83,17 +85,19 @@ def same_episodes(rows: Sequence[Row], base: Sequence[Row], objects: int | None 
     ]
 
 
-def change_of(pairs: Sequence[tuple[Row, Row]], measure: Callable[[Row], int | float | None]) -> PairedDifference:
+def change_of(
+    pairs: Sequence[tuple[EpisodeRow, EpisodeRow]], measure: Callable[[EpisodeRow], int | float | None]
+) -> PairedDifference:
     """How much larger a measure is in the first row of each pair; a pair where one of them has none is left out."""
     return _change([(measure(row), measure(other)) for row, other in pairs], [scene_of(row) for row, _ in pairs])
 
 
-def reached_change(pairs: Sequence[tuple[Row, Row]], goal: str) -> PairedDifference:
+def reached_change(pairs: Sequence[tuple[EpisodeRow, EpisodeRow]], goal: str) -> PairedDifference:
     """How much larger the share of episodes is that reached a goal."""
     return change_of(pairs, lambda row: step_of(row, goal) is not None)
 
 
-def steps_change(pairs: Sequence[tuple[Row, Row]], goal: str) -> PairedDifference:
+def steps_change(pairs: Sequence[tuple[EpisodeRow, EpisodeRow]], goal: str) -> PairedDifference:
     """How many more actions it took to reach a goal, over the pairs of which both episodes did."""
     return change_of(pairs, lambda row: step_of(row, goal))
 
@@ -103,7 +107,7 @@ def steps_change(pairs: Sequence[tuple[Row, Row]], goal: str) -> PairedDifferenc
 VariantDifferences = Mapping[str, Mapping[str, PairedDifference]]
 
 
-def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) -> VariantDifferences:
+def paired(rows: Sequence[EpisodeRow], baseline: str, columns: Sequence[str] = PAIRED) -> VariantDifferences:
     """How every other variant differs from the baseline, by label and goal.
 
     Several episodes of a variant that the columns do not tell apart count as one, with their mean. Scenarios of the
@@ -120,7 +124,7 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
     names = [canonical(name) for name in columns]
     # The content of a scenario belongs to its name.
     values = [column(rows, name) for name in (*names, *(("content_hash",) if "scenario" in names else ()))]
-    variants: dict[str, dict[tuple[Hashable, ...], list[Row]]] = {}
+    variants: dict[str, dict[tuple[Hashable, ...], list[EpisodeRow]]] = {}
     for label, pair, row in zip(label_variants(rows), zip(*values, strict=True), rows, strict=True):
         variants.setdefault(label, {}).setdefault(pair, []).append(row)
     base = variants.pop(baseline)
@@ -158,7 +162,7 @@ def _change(
     return PairedDifference.of([value for value, _ in differences], [scene for _, scene in differences])
 
 
-def _mean(rows: Sequence[Row], name: str, budget: int) -> float | None:
+def _mean(rows: Sequence[EpisodeRow], name: str, budget: int) -> float | None:
     """A mean over rows by its name, as `VariantDifferences` has it; None where there is nothing to average."""
     goal = name.removesuffix(RESTRICTED).removesuffix(STEPS)
     if name.endswith(RESTRICTED):

@@ -10,7 +10,7 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_intervals, share_interval
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT, canonical, grouped
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
 # The shares in `Events`, in the words of tables.
 EVENTS = {
@@ -119,30 +119,30 @@ class Events:
         return ["" if share is None else f"{share:.3f}" for share in shares]
 
 
-def step_of(row: Row, goal: str) -> int | None:
+def step_of(row: EpisodeRow, goal: str) -> int | None:
     """Number of actions after which an episode reached one of `GOALS`; None if it never did."""
     if goal == "retrieved":
         return row.steps if row.retrieved else None
     return row.found_step if goal == "found" else row.graspable_step
 
 
-def actions_of(row: Row) -> int | None:
+def actions_of(row: EpisodeRow) -> int | None:
     """Number of actions of an episode, attempts to take the target out among them; None of one that did not end."""
     return None if row.is_error else row.steps
 
 
-def mean_actions(rows: Sequence[Row]) -> float | None:
+def mean_actions(rows: Sequence[EpisodeRow]) -> float | None:
     """Mean number of actions of the episodes that did not end in an error; None where all did."""
     counts = [count for row in rows if (count := actions_of(row)) is not None]
     return sum(counts) / len(counts) if counts else None
 
 
-def scene_of(row: Row) -> tuple[str, str | None]:
+def scene_of(row: EpisodeRow) -> tuple[str, str | None]:
     """What an episode was run on: the scenario, by its name and content."""
     return row.scenario, row.content_hash
 
 
-def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Rates]:
+def summarise(rows: Sequence[EpisodeRow], columns: Sequence[str] = (VARIANT, "objects")) -> list[Rates]:
     """Rates for every combination of what columns say, and for each of all but the last column over all values of it.
 
     Usually by variant and number of objects, and for each variant over all of them.
@@ -158,13 +158,15 @@ def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")
     ]
 
 
-def _steps_and_scenes(rows: Sequence[Row], goal: str) -> tuple[list[int], list[Hashable]]:
+def _steps_and_scenes(rows: Sequence[EpisodeRow], goal: str) -> tuple[list[int], list[Hashable]]:
     """The actions until a goal and the scene of each episode that reached it."""
     reached = [(step, scene_of(row)) for row in rows if (step := step_of(row, goal)) is not None]
     return [step for step, _ in reached], [scene for _, scene in reached]
 
 
-def _rates(group: Mapping[str, Hashable], rows: Sequence[Row], steps_intervals: Sequence[Interval | None]) -> Rates:
+def _rates(
+    group: Mapping[str, Hashable], rows: Sequence[EpisodeRow], steps_intervals: Sequence[Interval | None]
+) -> Rates:
     """The rates of a group, with the intervals of the mean number of actions until each of `GOALS`."""
     count, actions = len(rows), max(sum(row.steps for row in rows), 1)
     by_paper = [row for row in rows if row.paper_graspable is not None]
@@ -187,7 +189,7 @@ def _rates(group: Mapping[str, Hashable], rows: Sequence[Row], steps_intervals: 
     )
 
 
-def _goal(rows: Sequence[Row], scenes: Sequence[Hashable], goal: str) -> dict[str, Any]:
+def _goal(rows: Sequence[EpisodeRow], scenes: Sequence[Hashable], goal: str) -> dict[str, Any]:
     """The fields of `Rates` that belong to a goal, without the interval of its steps."""
     steps = [step_of(row, goal) for row in rows]
     known_steps = [step for step in steps if step is not None]
@@ -198,7 +200,7 @@ def _goal(rows: Sequence[Row], scenes: Sequence[Hashable], goal: str) -> dict[st
     }
 
 
-def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Events]:
+def summarise_events(rows: Sequence[EpisodeRow], columns: Sequence[str] = (VARIANT, "objects")) -> list[Events]:
     """What happened on the way, grouped as `summarise` does; groups of which nothing is known are left out."""
     summary = []
     for group, members in with_totals(rows, columns):
@@ -206,7 +208,7 @@ def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "ob
         if not recorded:
             continue
 
-        def share(name: str, rows: Sequence[Row] = recorded) -> float:
+        def share(name: str, rows: Sequence[EpisodeRow] = recorded) -> float:
             return sum(getattr(row, name) > 0 for row in rows) / len(rows)
 
         looks, lost = (sum(getattr(row, name) for row in recorded) for name in ("looks", "truth_lost"))
@@ -226,7 +228,9 @@ def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "ob
     return summary
 
 
-def with_totals(rows: Sequence[Row], columns: Sequence[str]) -> Iterator[tuple[Mapping[str, Hashable], list[Row]]]:
+def with_totals(
+    rows: Sequence[EpisodeRow], columns: Sequence[str]
+) -> Iterator[tuple[Mapping[str, Hashable], list[EpisodeRow]]]:
     """The rows by columns, and after those that differ in the last one alone, with None for it, all of them."""
     names = [canonical(name) for name in columns]
     groups = grouped(rows, names)

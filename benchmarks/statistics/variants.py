@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.statistics.preset_names import PresetName, named_once, preset_name
-from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
+from mechsearch_jax.benchmarks.store.rows import OPTIONS, EpisodeRow, options_of
 from mechsearch_jax.config.fixed import without_fixed
 from mechsearch_jax.runtime.errors import InputError, nearest
 
@@ -40,7 +40,7 @@ def _left_out(name: str) -> str:
     return "usual" if "." in name else "unknown"
 
 
-def _options_of_variants(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, dict[str, Any]]]:
+def _options_of_variants(rows: Sequence[EpisodeRow]) -> tuple[list[Any], dict[Any, dict[str, Any]]]:
     """For each row its variant, and for each variant its options."""
     variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
@@ -48,7 +48,7 @@ def _options_of_variants(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, dict
     return variants, {variant: without_fixed(options_of(row)) for variant, row in each}
 
 
-def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
+def _differing(rows: Sequence[EpisodeRow]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
     """For each row its variant, and for each variant the policy and the options that differ."""
     variants, each = _options_of_variants(rows)
     names = sorted({name for options in each.values() for name in options} - {"policy"})
@@ -63,7 +63,7 @@ def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dic
     return variants, parts
 
 
-def label_variants(rows: Sequence[Row]) -> list[str]:
+def label_variants(rows: Sequence[EpisodeRow]) -> list[str]:
     """For each row the policy and those options that are not the same in all rows: "search-for-grasp, gamma 0.5".
 
     Rows that ran under different options never share a label.
@@ -101,7 +101,7 @@ class Key:
     presets: Mapping[str, PresetName] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, rows: Sequence[Row]) -> Key:
+    def of(cls, rows: Sequence[EpisodeRow]) -> Key:
         """The key of rows: labels without a policy that all have.
 
         Where one is too long, names by preset and what deviates from it; numbers where these are too long, too, or say
@@ -155,8 +155,8 @@ class Key:
         raise InputError(f'report: variant "{text}" is {"one of several" if matches else "unknown"}: {names}')
 
 
-def column(rows: Sequence[Row], name: str) -> list[Hashable]:
-    """What a column says of each row: a field of `Row`, an option, or "method" for the label of its variant.
+def column(rows: Sequence[EpisodeRow], name: str) -> list[Hashable]:
+    """What a column says of each row: a field of `EpisodeRow`, an option, or "method" for the label of its variant.
 
     Lists are joined by "/".
 
@@ -166,7 +166,7 @@ def column(rows: Sequence[Row], name: str) -> list[Hashable]:
     name = canonical(name)
     if name == VARIANT:
         return list(label_variants(rows))
-    fields = [field.name for field in dataclasses.fields(Row)]
+    fields = [field.name for field in dataclasses.fields(EpisodeRow)]
     if name in fields:
         return [getattr(row, name) for row in rows]
     variants = list(map(_variant, rows))
@@ -182,18 +182,18 @@ def column(rows: Sequence[Row], name: str) -> list[Hashable]:
 
 
 def canonical(name: str) -> str:
-    """A column's name as `Row` has it, of one that may be written as an option."""
+    """A column's name as `EpisodeRow` has it, of one that may be written as an option."""
     plain = name.strip().removeprefix("--").replace("-", "_")
     return _ALIASES.get(plain, plain)
 
 
-def grouped(rows: Sequence[Row], columns: Sequence[str]) -> dict[tuple[Hashable, ...], list[Row]]:
+def grouped(rows: Sequence[EpisodeRow], columns: Sequence[str]) -> dict[tuple[Hashable, ...], list[EpisodeRow]]:
     """The rows by what several columns say of them, in their order, where numbers count as such.
 
     Raises:
       InputError: there is no such column.
     """
-    groups: dict[tuple[Hashable, ...], list[Row]] = {}
+    groups: dict[tuple[Hashable, ...], list[EpisodeRow]] = {}
     for values, row in zip(zip(*(column(rows, name) for name in columns), strict=True), rows, strict=True):
         groups.setdefault(values, []).append(row)
     order: Callable[[tuple[Hashable, ...]], Any] = lambda values: tuple(map(natural, values))  # noqa: E731

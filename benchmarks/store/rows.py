@@ -64,7 +64,7 @@ class Scene(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class EpisodeRow:
     """One episode in a table of results; its fields are columns of the table, to which `write_rows` adds more.
 
     Attributes:
@@ -143,7 +143,7 @@ class Row:
     decision_version: int | None = None
 
     @classmethod
-    def of_episode(cls, episode: Episode, code: str = "") -> Row:
+    def of_episode(cls, episode: Episode, code: str = "") -> EpisodeRow:
         """The row of an episode that ran to its end, by the code that ran it."""
         spent = [{"simulate": 0.0, **step.timings} for step in episode.steps]
         libraries = {name: version for name, version in episode.versions.items() if name not in ("device", DECISIONS)}
@@ -171,7 +171,7 @@ class Row:
         )
 
     @classmethod
-    def failed(cls, scenario: Scene, options: Mapping[str, Any], reason: str, code: str = "") -> Row:
+    def failed(cls, scenario: Scene, options: Mapping[str, Any], reason: str, code: str = "") -> EpisodeRow:
         """The row of an episode that could not be run to its end; `options` are as in `Episode.config`."""
         return cls(
             scenario=scenario.name,
@@ -239,7 +239,7 @@ def _column(kind: Any) -> pyarrow.DataType:
     return _ARROW[plain[0] if plain else kind]
 
 
-_FIELDS = {name: _column(kind) for name, kind in get_type_hints(Row).items()}
+_FIELDS = {name: _column(kind) for name, kind in get_type_hints(EpisodeRow).items()}
 # The same in rows of the same episode, whichever table they are in.
 EPISODE = "episode"
 # Columns for who reads the table with something else; a row has all of it in its other fields.
@@ -263,7 +263,7 @@ def configuration(options: Mapping[str, Any]) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _options(text: str) -> Mapping[str, Any]:
-    """The options that a `Row.configuration` holds.
+    """The options that a `EpisodeRow.configuration` holds.
 
     Raises:
       ValueError: it is not a JSON object.
@@ -276,7 +276,7 @@ def _options(text: str) -> Mapping[str, Any]:
 
 @functools.lru_cache(maxsize=4096)
 def _canonical(text: str) -> str:
-    """A `Row.configuration` as `configuration` writes it; the same object for the same options.
+    """A `EpisodeRow.configuration` as `configuration` writes it; the same object for the same options.
 
     Raises:
       ValueError: it is not a JSON object.
@@ -287,12 +287,12 @@ def _canonical(text: str) -> str:
 _named = operator.attrgetter("scenario", "content_hash", *OPTIONS, "seed")
 
 
-def identity(row: Row) -> tuple[Any, ...]:
+def identity(row: EpisodeRow) -> tuple[Any, ...]:
     """What tells the rows of a table apart: the scenario, by its name and content, every option and the seed."""
     return *_named(row), _canonical(row.configuration)
 
 
-def episode_key(row: Row) -> str:
+def episode_key(row: EpisodeRow) -> str:
     """`KEY_DIGITS` hexadecimal digits that are the same for rows of the same `identity`."""
     text = repr((*_named(row), _digest(_canonical(row.configuration))))
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
@@ -300,17 +300,17 @@ def episode_key(row: Row) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _digest(text: str) -> str:
-    """Of a `Row.configuration`, which many rows share."""
+    """Of a `EpisodeRow.configuration`, which many rows share."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def options_of(row: Row) -> dict[str, Any]:
+def options_of(row: EpisodeRow) -> dict[str, Any]:
     """Every option of a row."""
     columns = {name: getattr(row, name) for name in OPTIONS}
     return {**_options(row.configuration), **columns, "actions": row.actions.split(ACTIONS_BETWEEN)}
 
 
-def read_rows(path: PathLike) -> list[Row]:
+def read_rows(path: PathLike) -> list[EpisodeRow]:
     """Rows of a Parquet file that `write_rows` wrote.
 
     Raises:
@@ -336,7 +336,7 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: {error}; use another file") from error
 
 
-def parse_row(text: str | bytes) -> Row:
+def parse_row(text: str | bytes) -> EpisodeRow:
     """A row from the JSON object of its fields.
 
     Raises:
@@ -351,7 +351,7 @@ def parse_row(text: str | bytes) -> Row:
     return _row({name: value[name] for name in _FIELDS if name in value})
 
 
-def _row(fields: dict[str, Any]) -> Row:
+def _row(fields: dict[str, Any]) -> EpisodeRow:
     """The row of these fields.
 
     Raises:
@@ -361,10 +361,10 @@ def _row(fields: dict[str, Any]) -> Row:
         fields["configuration"] = _canonical(fields["configuration"])
     except (TypeError, ValueError) as error:
         raise ValueError(f"the configuration of {fields['scenario']!r} is not a JSON object") from error
-    return Row(**fields)
+    return EpisodeRow(**fields)
 
 
-def write_rows(rows: Sequence[Row], path: PathLike) -> None:
+def write_rows(rows: Sequence[EpisodeRow], path: PathLike) -> None:
     """Write a table of episodes as Parquet, in place of the one that is there.
 
     Beside the fields of a row it has a column for every other option and for the simulator, and `episode`, which is

@@ -1,7 +1,8 @@
 """Stored runs: all rows of a run as one small Parquet file, and beside it what comes of them as JSON lines.
 
-`NAME.parquet` holds the fields of `Row` alone, in few bytes: what can be computed from them is left out, and times are
-rounded. `NAME.jsonl` has a line for each variant, scene set and number of objects; `report.store_run` makes it.
+`NAME.parquet` holds the fields of `EpisodeRow` alone, in few bytes: what can be computed from them is left out, and
+times are rounded. `NAME.jsonl` has a line for each variant, scene set and number of objects; `report.store_run` makes
+it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import pyarrow
 import pyarrow.parquet
 
-from mechsearch_jax.benchmarks.store.rows import SCHEMA, Row, episode_key, options_of, read_rows
+from mechsearch_jax.benchmarks.store.rows import SCHEMA, EpisodeRow, episode_key, options_of, read_rows
 from mechsearch_jax.benchmarks.store.shards import PREFIX, result_tables
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
@@ -29,7 +30,7 @@ SECONDS = ("planning_seconds", "simulation_seconds", "compile_seconds")
 DIGITS = 2
 # What may differ in two rows of an episode that agree.
 _INCIDENTAL = (*SECONDS, "device", "versions")
-_FIELDS = pyarrow.schema([SCHEMA.field(field.name) for field in dataclasses.fields(Row)])
+_FIELDS = pyarrow.schema([SCHEMA.field(field.name) for field in dataclasses.fields(EpisodeRow)])
 _NAME = re.compile(r"[a-z0-9]+(?:[-.][a-z0-9]+)*")
 
 
@@ -44,11 +45,11 @@ class StoredRun:
     """
 
     name: str
-    rows: tuple[Row, ...]
+    rows: tuple[EpisodeRow, ...]
     lines: tuple[Mapping[str, Any], ...]
 
 
-def variant_of(row: Row) -> str:
+def variant_of(row: EpisodeRow) -> str:
     """Twelve hexadecimal digits that rows share which ran with the same options, whatever the target and the seed."""
     options = {name: value for name, value in options_of(row).items() if name != "target"}
     return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:12]
@@ -61,7 +62,7 @@ def started(folders: Iterable[PathLike]) -> str | None:
     return min(("-".join(match.groups()) for name in names if (match := pattern.match(name))), default=None)
 
 
-def merged(folders: Sequence[PathLike]) -> list[Row]:
+def merged(folders: Sequence[PathLike]) -> list[EpisodeRow]:
     """The rows of results folders that are parts of one run, one for each episode.
 
     An episode without an error goes before the same one with an error, as in a folder.
@@ -69,8 +70,8 @@ def merged(folders: Sequence[PathLike]) -> list[Row]:
     Raises:
       InputError: a folder holds no results, they were run by different code, or two folders disagree about an episode.
     """
-    rows: dict[str, tuple[Row, Path]] = {}
-    first: tuple[Row, Path] | None = None
+    rows: dict[str, tuple[EpisodeRow, Path]] = {}
+    first: tuple[EpisodeRow, Path] | None = None
     for folder in folders:
         for place, table in result_tables(folder):
             for row in table:
@@ -85,7 +86,7 @@ def merged(folders: Sequence[PathLike]) -> list[Row]:
     return sorted((row for row, _ in rows.values()), key=lambda row: (row.configuration, row.scenario, row.seed))
 
 
-def _agreed(before: tuple[Row, Path], now: tuple[Row, Path]) -> tuple[Row, Path]:
+def _agreed(before: tuple[EpisodeRow, Path], now: tuple[EpisodeRow, Path]) -> tuple[EpisodeRow, Path]:
     """Which of two rows of an episode counts.
 
     Raises:
@@ -128,7 +129,7 @@ def write_run(run: StoredRun, folder: PathLike) -> list[Path]:
     return [table, lines]
 
 
-def _rounded(row: Row) -> Row:
+def _rounded(row: EpisodeRow) -> EpisodeRow:
     times = {name: value for name in SECONDS if (value := getattr(row, name)) is not None}
     return dataclasses.replace(row, **{name: round(value, DIGITS) for name, value in times.items()})
 

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
-from mechsearch_jax.benchmarks.store.rows import Row, episode_key, parse_row, read_rows, write_rows
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key, parse_row, read_rows, write_rows
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, check_writable
 
@@ -43,7 +43,7 @@ def _names(folder: Path, ending: str) -> set[str]:
     return {name.removesuffix(ending) for name in names if name.startswith(PREFIX) and name.endswith(ending)}
 
 
-def _parse(line: bytes, path: Path) -> Row:
+def _parse(line: bytes, path: Path) -> EpisodeRow:
     try:
         return parse_row(line)
     except ValueError as error:
@@ -52,7 +52,7 @@ def _parse(line: bytes, path: Path) -> Row:
         ) from error
 
 
-def _read_open(path: Path, offset: int = 0) -> tuple[list[Row], int]:
+def _read_open(path: Path, offset: int = 0) -> tuple[list[EpisodeRow], int]:
     """The rows of an open shard from a place in its file on, and the place where the next one begins.
 
     Raises:
@@ -91,7 +91,7 @@ class Results:
 
     def __init__(self, folder: PathLike) -> None:
         self.folder = Path(folder)
-        self.rows: dict[str, Row] = {}
+        self.rows: dict[str, EpisodeRow] = {}
         self.attempts: dict[str, int] = {}
         self._ranks: dict[str, tuple[bool, str, int]] = {}
         self._shards: dict[str, _Shard] = {}
@@ -112,7 +112,7 @@ class Results:
             fresh += [self._add(row, name, shard) for row in self._read(name, shard, name in closed)]
         return fresh
 
-    def _read(self, name: str, shard: _Shard, closed: bool) -> list[Row]:
+    def _read(self, name: str, shard: _Shard, closed: bool) -> list[EpisodeRow]:
         """The rows of a shard that have not been read."""
         path = self.folder / OPEN / (name + OPEN_ENDING)
         if not closed:
@@ -125,7 +125,7 @@ class Results:
         self._done.add(name)
         return rows
 
-    def _add(self, row: Row, name: str, shard: _Shard) -> str:
+    def _add(self, row: EpisodeRow, name: str, shard: _Shard) -> str:
         key, rank = episode_key(row), (row.is_error, name, shard.rows)
         shard.rows += 1
         self.attempts[key] = self.attempts.get(key, 0) + 1
@@ -157,7 +157,7 @@ class ShardWriter:
         self._folder, self._writer, self._most = Path(folder), writer, rows_per_shard
         check_writable(self._folder / OPEN)
         self._number = 0
-        self._rows: list[Row] = []
+        self._rows: list[EpisodeRow] = []
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> ShardWriter:
@@ -166,7 +166,7 @@ class ShardWriter:
     def __exit__(self, *details: object) -> None:
         self.close()
 
-    def append(self, rows: Sequence[Row]) -> None:
+    def append(self, rows: Sequence[EpisodeRow]) -> None:
         """Add rows; they are on disk when this returns.
 
         Raises:
@@ -233,7 +233,7 @@ def _write(file: IO[bytes], text: bytes) -> None:
     os.fsync(file.fileno())
 
 
-def close_shard(folder: PathLike, name: str, rows: Sequence[Row]) -> None:
+def close_shard(folder: PathLike, name: str, rows: Sequence[EpisodeRow]) -> None:
     """Make a Parquet file of an open shard's rows, and remove what they were in.
 
     Raises:
@@ -269,7 +269,7 @@ def close_shards_of(folder: PathLike, writer: str) -> None:
                     close_shard(folder, name, rows)
 
 
-def result_tables(path: PathLike) -> Iterator[tuple[Path, list[Row]]]:
+def result_tables(path: PathLike) -> Iterator[tuple[Path, list[EpisodeRow]]]:
     """The rows of a Parquet file or of a folder, table by table: a folder's shards are one, every other Parquet file in
     it is one, and the folders in it are as many as they hold.
 
@@ -286,7 +286,7 @@ def result_tables(path: PathLike) -> Iterator[tuple[Path, list[Row]]]:
     yield from tables
 
 
-def _tables_in(folder: Path) -> Iterator[tuple[Path, list[Row]]]:
+def _tables_in(folder: Path) -> Iterator[tuple[Path, list[EpisodeRow]]]:
     results = Results(folder)
     results.refresh()
     if results.rows:

@@ -11,12 +11,12 @@ from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interv
 from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.rates import actions_of, scene_of
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 
 # What is compared, by the words of tables: a number for each episode, or None where its row does not say.
 SHARES = tuple(WORDS[name] for name in COMPARED)
-MEASURES: Mapping[str, Callable[[Row], float | None]] = {
+MEASURES: Mapping[str, Callable[[EpisodeRow], float | None]] = {
     **{WORDS[name]: OUTCOMES[name] for name in COMPARED},
     "actions": actions_of,
 }
@@ -45,7 +45,7 @@ class Comparison:
     decision_seconds: float
 
 
-def compare(study: Study, rows: Sequence[Row]) -> list[Comparison]:
+def compare(study: Study, rows: Sequence[EpisodeRow]) -> list[Comparison]:
     """The variants of which there are rows, of any studies, in the order of the study."""
     groups = study.rows_of(rows)
     base = groups.get(study.baseline.label, [])
@@ -56,7 +56,7 @@ def compare(study: Study, rows: Sequence[Row]) -> list[Comparison]:
     ]
 
 
-def _comparison(variant: Variant, rows: Sequence[Row], base: Sequence[Row]) -> Comparison:
+def _comparison(variant: Variant, rows: Sequence[EpisodeRow], base: Sequence[EpisodeRow]) -> Comparison:
     means, intervals = {}, {}
     pairs = same_episodes(rows, base)
     for name, measure in MEASURES.items():
@@ -135,7 +135,7 @@ def cells(comparison: Comparison) -> list[str]:
     return [*line, *shares, with_interval(actions.mean, actions.interval, "{:+.1f}")]
 
 
-def screen(study: Study, rows: Sequence[Row]) -> Table:
+def screen(study: Study, rows: Sequence[EpisodeRow]) -> Table:
     """The study as it is printed."""
     comparisons = compare(study, rows)
     title = f"\n{study.name}: {study.question}\n{sentence(study, comparisons)}"

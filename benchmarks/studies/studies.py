@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
-from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
+from mechsearch_jax.benchmarks.store.rows import OPTIONS, EpisodeRow, options_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import Block, find_set, set_scenes
 from mechsearch_jax.envs.simulators.named import EngineName
@@ -88,7 +88,7 @@ class Study:
         scenes = set_scenes(find_set(self.scenes))
         return [(block, index) for block, index in scenes if variant.scenes is None or index < variant.scenes]
 
-    def rows_of(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
+    def rows_of(self, rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
         """The rows of each variant on the study's scenes, by its label; a variant without rows is left out.
 
         A row is a variant's if it differs from the default in the same options. Where a variant may run in any
@@ -97,7 +97,7 @@ class Study:
         blocks = {block.name for block in find_set(self.scenes).blocks}
         # Thousands of rows have the same few options.
         keys_of: dict[Hashable, tuple[str, str]] = {}
-        groups: dict[tuple[str, str], list[Row]] = {}
+        groups: dict[tuple[str, str], list[EpisodeRow]] = {}
         for row in rows:
             if row.scenario.rpartition("-")[0] in blocks:
                 ran_with = _ran_with(row)

@@ -27,14 +27,14 @@ from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.targets.antipodal import Approaches, gripper_poses, lines
 from mechsearch_jax.candidate_pairs import is_grasp
-from mechsearch_jax.envs.trials.native import Cell, NativeTrials
-from mechsearch_jax.envs.trials.nearby import Nearby
+from mechsearch_jax.envs.trials.native import NativeTrials, TrialSetup
+from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
 from mechsearch_jax.problem.settings import Settings
-from mechsearch_jax.retrieval import GraspChoice, TargetGrasps, found_grasps, target_grasps, worth_trying
+from mechsearch_jax.retrieval import GraspChoice, TargetGrasps, found_grasps, target_grasps, top_grasps
 from mechsearch_jax.robot.entry import ways_in
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
@@ -134,7 +134,7 @@ def _planned(
 ) -> tuple[Bool[Array, " f"], GraspChoice]:
     """Which grasps of a target are feasible at a pose, and those that are worth trying."""
     found = found_grasps(grasps, grasps.standing(pose))
-    return found.feasible, worth_trying(grasps, scene, pose)
+    return found.feasible, top_grasps(grasps, scene, pose)
 
 
 @functools.partial(jax.jit, static_argnames=("config",))
@@ -182,7 +182,7 @@ class Bench:
     @functools.cached_property
     def trials(self) -> NativeTrials:
         """What judges both sides: no scenes nearby, since the place is known exactly."""
-        return NativeTrials(nearby=Nearby(scenes=0))
+        return NativeTrials(nearby=Perturbations(scenes=0))
 
     def run(self, on_progress: Callable[[list[Row]], None] = lambda rows: None) -> list[Row]:
         """The rows of all meshes.
@@ -280,7 +280,7 @@ class Bench:
         self, target: Target, pose: Float[np.ndarray, " 3"], actions: Action, wanted: Bool[np.ndarray, " k"]
     ) -> list[int]:
         """Results of the wanted actions in order, up to the first that succeeds."""
-        cell = Cell(target, self.settings.workcell.shelf, self.settings.workcell.gripper)
+        cell = TrialSetup(target, self.settings.workcell.shelf, self.settings.workcell.gripper)
         objects, one = jax.tree.map(lambda a: jnp.asarray(a)[None], empty(TARGET)), jnp.ones(1)
         scenes = TrialScenes(objects, jnp.asarray(pose)[None], jnp.ones(1, bool), one, one)
         row = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(actions))

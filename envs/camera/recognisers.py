@@ -42,7 +42,7 @@ from mechsearch_jax.perception.parts.segments import Connected
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -109,7 +109,7 @@ class ImageRecogniser:
         return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence, measured)
 
 
-@kept(static_argnames=("recogniser",))
+@cached_jit(static_argnames=("recogniser",))
 def labelled(
     key: Key[Array, ""],
     recogniser: ImageRecogniser,
@@ -229,7 +229,7 @@ def sighted(
     return image, points, depth, detection
 
 
-@kept(static_argnames=("recogniser", "unseen"))
+@cached_jit(static_argnames=("recogniser", "unseen"))
 def detected(
     keys: Key[Array, "2"],
     recogniser: ColourRecogniser,

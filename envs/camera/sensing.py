@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key
 from mechsearch_jax.envs.camera.colour_image import ColourSensing
 from mechsearch_jax.envs.camera.holes import HOLES, DrawnHoles
 from mechsearch_jax.envs.camera.simulated_camera import Image
-from mechsearch_jax.envs.world.mismatch import ActualCell, Mismatch
+from mechsearch_jax.envs.world.mismatch import Mismatch, TrueCell
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.geometry.footprints import extents
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -76,7 +76,7 @@ class Sensing(flax.struct.PyTreeNode):
     holes: DrawnHoles | None = None
 
 
-def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
+def sensing_of(mismatch: Mismatch, cell: TrueCell) -> Sensing | None:
     """The sensing of an episode, as NumPy arrays; None if it is as the planner assumes."""
     place, noise, colour, sizes, holes = None, None, None, None, None
     if mismatch.moves_camera:

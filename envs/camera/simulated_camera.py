@@ -20,7 +20,7 @@ from mechsearch_jax.envs.camera.compound_rays import cast_solids, solid_normals
 from mechsearch_jax.envs.world.model import shelf_corners
 from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, TargetCompoundWorld, World
 from mechsearch_jax.geometry.transforms import rotate
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import MOST_SOLIDS
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
@@ -193,7 +193,7 @@ def _first_bodies(camera: Camera, shelf: Shelf, world: World, directions: Array)
     return depth, owner, _normals(camera, shelf, world, directions, depth, owner)
 
 
-@kept()
+@cached_jit()
 def observe(camera: Camera, world: World, shelf: Shelf | None = None, appearance: Appearance | None = None) -> Image:
     """The camera's image of the shelf and everything on it; the robot is out of the way.
 
@@ -265,7 +265,7 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
     return pixels_in_window(camera, world, window or window_of(camera, world))
 
 
-@kept(static_argnames=("window",))
+@cached_jit(static_argnames=("window",))
 def pixels_in_window(camera: Camera, world: World, window: int) -> Int[Array, ""]:
     """`target_pixels` in a window of a given side in pixels, which is static."""
     centre, _ = project(camera, world.position[TARGET])

@@ -19,7 +19,7 @@ from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
@@ -172,7 +172,7 @@ def is_the_target(snapshot: Snapshot, observation: Observation) -> Bool[Array, "
     return observation.target_visible & snapshot.target_seen & (jnp.sum(apart**2) < NEAR_TARGET**2)
 
 
-@kept()
+@cached_jit()
 def nearest_bodies(world: World, objects: Superquadrics) -> tuple[Int[Array, " 8"], Bool[Array, " 8"]]:
     """The number of a body for each of eight objects, each number once, and whether the object stands for that body.
 
@@ -232,7 +232,7 @@ def _seen_objects(snapshot: Snapshot) -> tuple[Superquadrics, Bool[Array, ""], F
     return objects.replace(valid=objects.valid & ~lost[:TARGET]), measured, depth
 
 
-@kept()
+@cached_jit()
 def in_holes(
     view: View, world: World, shelf: Shelf, sensing: Sensing
 ) -> tuple[Float[Array, "h w"], Bool[Array, " 9"], Int[Array, ""]]:
@@ -262,14 +262,14 @@ def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
     return _on_the_board(plain_objects(snapshot.world), snapshot.shelf)
 
 
-@kept()
+@cached_jit()
 def _on_the_board(world: World, shelf: Shelf) -> Superquadrics:
     scene = true_superquadrics(world)
     fallen = (scene.position[:, 0] < shelf.front) | (scene.position[:, 2] < shelf.board)
     return scene.replace(valid=scene.valid & ~fallen)
 
 
-@kept()
+@cached_jit()
 def true_target_pose(world: World) -> Float[Array, " 3"]:
     """x, y [m] and yaw [rad] of the target."""
     R, t = world.rotation[TARGET], world.position[TARGET]

@@ -31,13 +31,13 @@ from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.simulator import Flowing, Simulator
-from mechsearch_jax.envs.world.mismatch import ASSUMED, ActualCell, Mismatch
+from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch, TrueCell
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.planner import Policy, Problem
 from mechsearch_jax.planner.noted_trials import nothing_tried
 from mechsearch_jax.planner.trials import Trials
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.scenario import Scenario
 
 
@@ -51,7 +51,7 @@ class Start:
       policy, max_steps, options: where they are not None, instead of those of the run. With several slots the policies
         of a run may differ in numbers alone; see `policy_numbers`.
       mismatch: how the simulated world differs from what the planner assumes. With several slots all mismatches of a
-        run must have the same `mould`.
+        run must have the same `compile_key`.
     """
 
     scenario: Scenario
@@ -61,7 +61,7 @@ class Start:
     options: Mapping[str, Any] | None = None
     mismatch: Mismatch = ASSUMED
 
-    def cell(self, problem: Problem) -> ActualCell:
+    def cell(self, problem: Problem) -> TrueCell:
         """The cell of the episode, where a problem says what the planner assumes."""
         return self.mismatch.drawn(self.scenario, self.seed, problem.camera, problem.shelf)
 
@@ -303,7 +303,7 @@ def _chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, 
     return jax.device_put((actions, np.isin(np.arange(count), list(choices))))
 
 
-@kept()
+@cached_jit()
 def keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) -> tuple[Array, Array]:
     """The planner's and the environment's key of every slot at its present step."""
     keys, fold = jax.random.wrap_key_data(data), jax.vmap(jax.random.fold_in)

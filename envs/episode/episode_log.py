@@ -19,7 +19,7 @@ from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.touching import unrest
 from mechsearch_jax.envs.world.world import TARGET, World, fallen_over
 from mechsearch_jax.planner import Decision
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -59,7 +59,7 @@ class Choice(flax.struct.PyTreeNode):
         return dataclasses.replace(record, object=None) if is_phantom else record
 
 
-@kept()
+@cached_jit()
 def chosen(decision: Decision) -> Choice:
     """The `Choice` of a decision."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))

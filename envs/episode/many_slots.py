@@ -17,15 +17,15 @@ from mechsearch_jax.belief.belief import sweeps_unmeasured, without_grasps
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of, truth_unseen
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
-from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
+from mechsearch_jax.envs.episode.policy_numbers import as_pytree, compile_key, numbers, with_numbers
 from mechsearch_jax.envs.episode.slots import BeliefSummary, may_be_blind, sizes_and_truths, summary
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.learning import LearnedFriction, LearnsFriction
-from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, scenes_of
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.planner.trials import TrialResult, Trials, TrialScenes, TwoStagePolicy, choose, scenes_of
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, program
 
@@ -43,7 +43,7 @@ class Question(NamedTuple):
     """What a policy is called for.
 
     Attributes:
-      method: its name; one of a policy that `AsksTwice`, or "__call__".
+      method: its name; one of a policy that `TwoStagePolicy`, or "__call__".
       hidden: whether the target is found in none of the slots.
     """
 
@@ -92,7 +92,7 @@ class ManySlots:
         """
         self._problem, self._trials = problem, trials
         self._learned = LearnedFriction(trials, len(world.kind)) if isinstance(trials, LearnsFriction) else None
-        self._policy, self._mould = as_pytree(policy), mould(policy)
+        self._policy, self._compile_key = as_pytree(policy), compile_key(policy)
         self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf, problem.target)
         self._at_once = at_once
         self._count = len(world.kind)
@@ -129,7 +129,7 @@ class ManySlots:
         done = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype), no_action())
         fresh = jax.ShapeDtypeStruct((self._count,), bool)
         problem, state = self._problem, self._state
-        questions = [HIDDEN, FOUND, RETRIEVAL] if isinstance(self._policy, AsksTwice) else [ANYTHING]
+        questions = [HIDDEN, FOUND, RETRIEVAL] if isinstance(self._policy, TwoStagePolicy) else [ANYTHING]
         calls = [(self._policy, own, problem, state, keys, rows, question) for question in questions]
 
         def choosing(call: tuple[Any, ...]) -> Callable[[], None] | None:
@@ -164,7 +164,7 @@ class ManySlots:
 
     def _numbers_of(self, policy: Policy) -> tuple[np.ndarray, ...]:
         if id(policy) not in self._policies:
-            if mould(policy) != self._mould:
+            if compile_key(policy) != self._compile_key:
                 raise InputError("run_episodes: policies of one run that differ in more than numbers need runs each")
             self._policies[id(policy)] = policy, numbers(as_pytree(policy))
         return self._policies[id(policy)][1]
@@ -195,7 +195,7 @@ class ManySlots:
         Whether to take a target out is decided only where it is found, and a plan made only where it is not taken out.
         What is worth trying out is tried in all slots together.
         """
-        if not isinstance(self._policy, AsksTwice):
+        if not isinstance(self._policy, TwoStagePolicy):
             return self._ask(ANYTHING, keys, rows, last)
         there = np.asarray(self._state.belief.found)
         choices = self._ask(RETRIEVAL, keys, [r for r in rows if there[r]], last)
@@ -276,14 +276,14 @@ def _rows_of(tree: Any, rows: Int[Array, " n"]) -> Any:
     return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
 
 
-@kept()
+@cached_jit()
 def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
     here = _rows_of(world, rows)
     return here.replace(valid=here.valid & (rows < len(world.kind))[:, None])
 
 
-@kept()
+@cached_jit()
 def _blind(problem: Problem, state: PlannerState, action: Action, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
     """Whether actions in the slots `rows` sweep space that was not measured."""
     here = _rows_of(state, rows)
@@ -291,7 +291,7 @@ def _blind(problem: Problem, state: PlannerState, action: Action, rows: Int[Arra
     return jax.vmap(sweeps)(here.belief, here.observation.objects, action)
 
 
-@kept()
+@cached_jit()
 def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
     """Let the fresh slots know nothing."""
     belief, action = jax.tree.map(
@@ -302,13 +302,13 @@ def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"])
     return state.replace(belief=belief, action=action, truth=state.truth.replace(shown=state.truth.shown & ~fresh))
 
 
-@kept()
+@cached_jit()
 def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> PlannerState:
     """Keep what was decided in the slots `rows` until the next look."""
     return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
 
 
-@kept(static_argnames=("recogniser",))
+@cached_jit(static_argnames=("recogniser",))
 def _look(
     problem: Problem,
     state: PlannerState,
@@ -335,7 +335,7 @@ def _look(
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 
-@kept(static_argnames=("question",))
+@cached_jit(static_argnames=("question",))
 def _propose(
     policy: Policy,
     own: tuple[Array, ...],
@@ -371,7 +371,7 @@ def _propose(
     return jax.vmap(propose)(own, _rows_of(keys, rows), slot_state.replace(belief=belief, observation=seen))
 
 
-@kept()
+@cached_jit()
 def _choose(decisions: Decision, results: Int[Array, "n k"] | None, last: Bool[Array, " n"]) -> Choice:
     """What decisions come down to after trials, of which there may have been none; `last` as for `choose`."""
     if results is not None:

@@ -11,7 +11,7 @@ from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.fixed import AS_IN_PAPER, without_fixed
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.camera.snapshot import Recogniser
-from mechsearch_jax.envs.episode.policy_numbers import mould
+from mechsearch_jax.envs.episode.policy_numbers import compile_key
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -83,7 +83,7 @@ class Method:
         """
         return recogniser(self.recognition, target, self.workcell.detector)
 
-    def mould(self) -> Hashable:
+    def compile_key(self) -> Hashable:
         """A key of the programs compiled for episodes of one target.
 
         It is equal for methods that differ only in numbers of their policies, such as gamma, in the number of steps, or
@@ -93,7 +93,7 @@ class Method:
           InputError: as `policy`.
         """
         shared = self.workcell, self.config.problem, self.recognition, self.engine
-        return *shared, self.rehearsal, self.mismatch.mould(), mould(self.policy())
+        return *shared, self.rehearsal, self.mismatch.compile_key(), compile_key(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.

@@ -39,13 +39,13 @@ def with_numbers(policy: Any, values: Sequence[Any]) -> Any:
     return jax.tree.unflatten(tree, [next(rest) if _is_number(leaf) else leaf for leaf in leaves])
 
 
-def mould(policy: Policy) -> Hashable:
+def compile_key(policy: Policy) -> Hashable:
     """A key of a policy's compiled program: equal for policies that differ in numbers alone and may share a batch."""
     leaves, tree = jax.tree.flatten(as_pytree(policy))
-    return tree, tuple(map(_mould, leaves))
+    return tree, tuple(map(_leaf_key, leaves))
 
 
-def _mould(leaf: Any) -> Hashable:
+def _leaf_key(leaf: Any) -> Hashable:
     if _is_number(leaf):
         return np.asarray(leaf).dtype.kind
     if isinstance(leaf, np.ndarray | jax.Array):

@@ -29,7 +29,7 @@ from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_be
 from mechsearch_jax.planner.learning import restored
 from mechsearch_jax.planner.noted_trials import NotedTrials
 from mechsearch_jax.planner.trials import Trials, decide
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,7 +206,7 @@ def summary(problem: Problem, belief: Belief, truth: Truth, world: World) -> Bel
     return BeliefSummary(*jax.device_get(fields))
 
 
-@kept()
+@cached_jit()
 def sizes_and_truths(problem: Problem, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array, Array]:
     """Number of candidate poses where the target can be, whether it can be at the one nearest to the truth, and whether
     at any in that one's cell or in the eight around it."""

@@ -24,7 +24,7 @@ from mechsearch_jax.retrieval import (
     target_grasps,
 )
 from mechsearch_jax.robot.gripper import Gripper
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.session.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -85,7 +85,7 @@ def judged_sets(problem: Problem) -> tuple[TargetGrasps, TargetGrasps]:
     return problem.target_grasps, paper_grasps(problem.shelf, problem.gripper, problem.target)
 
 
-@kept()
+@cached_jit()
 def free_in_sets(
     sets: Sequence[TargetGrasps],
     scene: Superquadrics,
@@ -108,7 +108,7 @@ def free_in_sets(
     return [jnp.any(part) for part in jnp.split(free, ends)]
 
 
-@kept()
+@cached_jit()
 def graspable_many(
     sets: Sequence[TargetGrasps], camera: Camera, worlds: World, active: Bool[Array, " n"]
 ) -> list[Bool[Array, " n"]]:

@@ -25,7 +25,7 @@ from mechsearch_jax.planner import Belief, Decision, Problem, graspability_map, 
 from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.retrieval import TargetGrasps, found_grasps, found_hits
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.session.preparing import Program, program
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
@@ -77,7 +77,7 @@ class Evidence:
     tried: TriedActions
 
 
-@kept()
+@cached_jit()
 def grasps_at(
     grasps: TargetGrasps, objects: Superquadrics, pose: Float[Array, "3"]
 ) -> tuple[Bool[Array, " f"], Bool[Array, "f n"]]:

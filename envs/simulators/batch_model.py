@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.mismatch import ActualCell
+from mechsearch_jax.envs.world.mismatch import TrueCell
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.shapes import in_order
 
@@ -45,7 +45,7 @@ class BodyFields(flax.struct.PyTreeNode):
 
 
 class Cells(flax.struct.PyTreeNode):
-    """How the worlds differ from what the planner assumes: what of an `ActualCell` this simulator's model holds.
+    """How the worlds differ from what the planner assumes: what of an `TrueCell` this simulator's model holds.
 
     Attributes:
       friction: factors on all sliding frictions, shape (worlds,).
@@ -60,7 +60,7 @@ class Cells(flax.struct.PyTreeNode):
     quaternion: jax.Array
 
 
-def cells_of(blank: mujoco.MjModel, cells: Sequence[ActualCell]) -> Cells:
+def cells_of(blank: mujoco.MjModel, cells: Sequence[TrueCell]) -> Cells:
     """The cells of all worlds, float32; their physics are left out."""
     poses = [models.base_pose(blank, cell.T_world_base) for cell in cells]
     columns = (

@@ -52,10 +52,10 @@ from mechsearch_jax.envs.simulators.mjx_step import (
     waiting,
 )
 from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import TARGET, World, alike, from_scenario
-from mechsearch_jax.runtime.compiled import Kept
+from mechsearch_jax.runtime.compiled import CachedJit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program
 from mechsearch_jax.workspace.camera import Camera
@@ -86,8 +86,8 @@ class MjxSimulator:
         self.world: World | None = None
         self._fields: BodyFields | None = None
         # Of all worlds now, and of those that begin next.
-        self._cells: list[ActualCell] = []
-        self._next_cells: dict[int, ActualCell] = {}
+        self._cells: list[TrueCell] = []
+        self._next_cells: dict[int, TrueCell] = {}
         self._data: Any = None
         # Task and progress of all worlds, and which outcomes were reported already; which worlds are moving.
         self._tasks: tuple[Task, Progress, Array] | None = None
@@ -126,12 +126,12 @@ class MjxSimulator:
         """Take another model, with which everything is compiled anew."""
         self._model, self._data = model, None
         # These depend on this simulator's model, so that no other process could use them.
-        self._start = Kept(model.start, on_disk=False)
-        self._place = Kept(placed, on_disk=False, donate_argnums=(1,))
-        self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
-        self._go_on = Kept(self._gone_on, on_disk=False, donate_argnums=(1,))
+        self._start = CachedJit(model.start, on_disk=False)
+        self._place = CachedJit(placed, on_disk=False, donate_argnums=(1,))
+        self._begin = CachedJit(self._begun, on_disk=False, donate_argnums=(0,))
+        self._go_on = CachedJit(self._gone_on, on_disk=False, donate_argnums=(1,))
         self._prepared: frozenset[int] = frozenset()
-        self._merge = Kept(tasks_merged, on_disk=False)
+        self._merge = CachedJit(tasks_merged, on_disk=False)
         self._settle = jax.jit(self._simulate, donate_argnums=1)
         self._rollout = jax.jit(self._follow, donate_argnums=1)
 
@@ -141,7 +141,7 @@ class MjxSimulator:
         if room.get(TARGET) != now.get(TARGET) or (room and not now):
             self._adopt(MjxModel(self.shelf, self.camera, self.config, room))
 
-    def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
+    def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
         """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`.
 
         Raises:

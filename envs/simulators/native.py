@@ -20,7 +20,7 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, check_actions
 from mechsearch_jax.envs.simulators.trace import Trace
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, outcome_of
 from mechsearch_jax.envs.world.world import BODIES, World, alike
 from mechsearch_jax.runtime.cores import cores
@@ -58,7 +58,7 @@ class NativeSimulator:
         self._config, self._shelf, self._camera = config, shelf, camera
         self._threads = threads or cores()
         self._worlds: list[NativeWorld] = []
-        self._cells: dict[int, ActualCell] = {}
+        self._cells: dict[int, TrueCell] = {}
 
     @property
     def traces(self) -> list[Trace]:
@@ -87,7 +87,7 @@ class NativeSimulator:
             self._worlds[i].reset(scenario, self._cells.pop(i, ASSUMED_CELL))
         return self._gather()
 
-    def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
+    def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
         """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`."""
         self._cells.update(cells)
 

@@ -26,7 +26,7 @@ from mechsearch_jax.envs.simulators.physics import PHYSICS
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls, resampled, way_back
 from mechsearch_jax.envs.simulators.trace import Recorder, Trace
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, outcome_of
 from mechsearch_jax.envs.world.touching import Touch, touches
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
@@ -77,7 +77,7 @@ class NativeWorld:
         """What happened during the last action."""
         return self._recorder.trace(self._model)
 
-    def reset(self, scenario: Scenario, cell: ActualCell = ASSUMED_CELL) -> World:
+    def reset(self, scenario: Scenario, cell: TrueCell = ASSUMED_CELL) -> World:
         """Start an episode; see `Simulator.reset`.
 
         Args:
@@ -143,7 +143,7 @@ class NativeWorld:
         target = bodies.pop(TARGET)
         return Scenario(name, tuple(bodies.values()), target)
 
-    def place(self, bodies: list[Body | None], cell: ActualCell = ASSUMED_CELL) -> None:
+    def place(self, bodies: list[Body | None], cell: TrueCell = ASSUMED_CELL) -> None:
         """Start from bodies, everything at rest and the robot at home; `world` stays what it was.
 
         Args:

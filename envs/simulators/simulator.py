@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.mismatch import ActualCell
+from mechsearch_jax.envs.world.mismatch import TrueCell
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.robot.kinematics import HOME
@@ -148,7 +148,7 @@ class Flowing(Protocol):
 class TakesCells(Protocol):
     """A `Simulator` whose worlds may differ from what the planner assumes."""
 
-    def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
+    def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
         """Set the cells of worlds, by their numbers, for the next episodes that begin in them."""
         ...
 

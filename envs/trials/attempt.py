@@ -22,7 +22,7 @@ from mechsearch_jax.actions import Kind
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.mismatch import ActualCell
+from mechsearch_jax.envs.world.mismatch import TrueCell
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.planner.trials import TrialResult
@@ -88,7 +88,7 @@ class TrialScene(NativeWorld):
         """
         super().__init__(shelf, config=config, blank=blank_model(shelf, config.motion.timestep))
         self._origins = np.zeros((BODIES, 3)) if origins is None else origins
-        self.place(bodies, ActualCell(friction, mass))
+        self.place(bodies, TrueCell(friction, mass))
         self._model.opt.sleep_tolerance = config.rest_speed
         self._hide_what_is_no_body()
         self._rest_again(np.empty((0, 0)))

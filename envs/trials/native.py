@@ -31,7 +31,7 @@ from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.compounds import with_parts, with_target
-from mechsearch_jax.envs.trials.nearby import Nearby, ScenesNear
+from mechsearch_jax.envs.trials.nearby import Perturbations, PerturbedScenes
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, outer_shape
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
@@ -40,7 +40,7 @@ from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.motion import MotionConfig, Reference
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, motions, program
@@ -48,10 +48,10 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 # Scenes near that of a row; None for one that MuJoCo cannot build.
-_Near = ScenesNear[TrialScene | None]
+_Near = PerturbedScenes[TrialScene | None]
 
 
-class Cell(NamedTuple):
+class TrialSetup(NamedTuple):
     """The parts of a problem that trials need."""
 
     target: Target
@@ -79,7 +79,7 @@ class NativeTrials:
     """
 
     simulation: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
-    nearby: Nearby = dataclasses.field(default_factory=Nearby)
+    nearby: Perturbations = dataclasses.field(default_factory=Perturbations)
     threads: int | None = None
     friction: float = 1.0
 
@@ -95,10 +95,10 @@ class NativeTrials:
         Raises:
           InputError: the simulator has too few slots for the objects.
         """
-        return self.in_cell(Cell(problem.target, problem.shelf, problem.gripper), scenes, actions, wanted)
+        return self.in_cell(TrialSetup(problem.target, problem.shelf, problem.gripper), scenes, actions, wanted)
 
     def in_cell(
-        self, cell: Cell, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
+        self, cell: TrialSetup, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
     ) -> Int[np.ndarray, "r k"]:
         """`__call__` without a problem."""
         if scenes.objects.valid.shape[-1] > TARGET:
@@ -113,7 +113,7 @@ class NativeTrials:
             def near(number: int) -> TrialScene | None:
                 return self._scene(cell, simulation, self.nearby.drawn(scenes, number), row)[1] if number else scene
 
-            return world, ScenesNear(near)
+            return world, PerturbedScenes(near)
 
         def attempt(made: tuple[World, _Near], row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
             world, near = made
@@ -149,10 +149,10 @@ class NativeTrials:
           actions: one for each, of a kind that moves the arm.
           arm_stop: error of a joint at which the arm may stop [rad].
         """
-        return self.ends_in_cell(Cell(problem.target, problem.shelf, problem.gripper), scenes, actions, arm_stop)
+        return self.ends_in_cell(TrialSetup(problem.target, problem.shelf, problem.gripper), scenes, actions, arm_stop)
 
     def ends_in_cell(
-        self, cell: Cell, scenes: TrialScenes, actions: Action, arm_stop: float
+        self, cell: TrialSetup, scenes: TrialScenes, actions: Action, arm_stop: float
     ) -> Float[np.ndarray, "r 2 n 3"]:
         """`ends` without a problem."""
         simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
@@ -178,7 +178,7 @@ class NativeTrials:
             return np.stack(list(pool.map(end, range(len(scenes.found)))))
 
     def _scene(
-        self, cell: Cell, simulation: SimulatorConfig, scenes: TrialScenes, row: int
+        self, cell: TrialSetup, simulation: SimulatorConfig, scenes: TrialScenes, row: int
     ) -> tuple[World, TrialScene | None]:
         """The world of a row, and the scene in which it is at rest; None if it cannot be built."""
         objects = jax.tree.map(lambda a: a[row], scenes.objects)
@@ -188,9 +188,9 @@ class NativeTrials:
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
-        return self.cell_programs(Cell(problem.target, problem.shelf, problem.gripper))
+        return self.cell_programs(TrialSetup(problem.target, problem.shelf, problem.gripper))
 
-    def cell_programs(self, cell: Cell) -> list[Program]:
+    def cell_programs(self, cell: TrialSetup) -> list[Program]:
         """`programs` without a problem."""
         nowhere = jax.device_get((empty(TARGET), jnp.zeros(3), jnp.array(False)))
         return [
@@ -198,7 +198,7 @@ class NativeTrials:
             program("small ones", trial_world, *cell[:2], *nowhere),
         ]
 
-    def _motion_config(self, cell: Cell) -> MotionConfig:
+    def _motion_config(self, cell: TrialSetup) -> MotionConfig:
         return dataclasses.replace(self.simulation.motion, gripper=cell.gripper)
 
 
@@ -214,7 +214,7 @@ def _attempted(
         return TrialResult.UNKNOWN
 
 
-@kept(on_host=True)
+@cached_jit(on_host=True)
 def trial_world(
     target: Target, shelf: Shelf, objects: Superquadrics, pose: Float[Array, "3"], found: Bool[Array, ""]
 ) -> World:
@@ -231,7 +231,7 @@ def trial_world(
 
 
 def scene_at_rest(
-    cell: Cell,
+    cell: TrialSetup,
     simulation: SimulatorConfig,
     world: World,
     objects: Superquadrics,

@@ -24,7 +24,7 @@ SEED = 7
 
 
 @dataclasses.dataclass(frozen=True)
-class Nearby:
+class Perturbations:
     """How many scenes near a recognised one, and how far off they are: about recognition's own error.
 
     Attributes:
@@ -47,12 +47,12 @@ class Nearby:
     def __post_init__(self):
         for name in ("friction", "mass"):
             if not 1 <= getattr(self, name) < math.inf:
-                raise InputError(f"Nearby: {name} {getattr(self, name)} must be a finite factor of at least 1")
+                raise InputError(f"Perturbations: {name} {getattr(self, name)} must be a finite factor of at least 1")
         for name in ("scenes", "place", "size"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"Nearby: {name} {getattr(self, name)} must be finite and not negative")
+                raise InputError(f"Perturbations: {name} {getattr(self, name)} must be finite and not negative")
         if self.scenes != int(self.scenes):
-            raise InputError(f"Nearby: scenes {self.scenes} must be a whole number")
+            raise InputError(f"Perturbations: scenes {self.scenes} must be a whole number")
 
     def drawn(self, scenes: TrialScenes, number: int) -> TrialScenes:
         """All scenes, each a little off; the same differences whenever the number is the same.
@@ -81,7 +81,7 @@ class Nearby:
         )
 
 
-class ScenesNear(Generic[Scene]):
+class PerturbedScenes(Generic[Scene]):
     """A scene, by the number 0, and those near it, each made when first needed, by one thread.
 
     Args:

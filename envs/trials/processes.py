@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action
-from mechsearch_jax.envs.trials.native import Cell, NativeTrials
+from mechsearch_jax.envs.trials.native import NativeTrials, TrialSetup
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
 from mechsearch_jax.runtime.compiled import keep_in, kept_in
@@ -149,8 +149,8 @@ class ProcessTrials:
             return unknown
 
 
-def _cell(problem: Problem) -> Cell:
-    return Cell(problem.target, jax.device_get(problem.shelf), problem.gripper)
+def _cell(problem: Problem) -> TrialSetup:
+    return TrialSetup(problem.target, jax.device_get(problem.shelf), problem.gripper)
 
 
 def _keep(executables: Path | None, cache: Mapping[str, Any]) -> None:
@@ -161,7 +161,7 @@ def _keep(executables: Path | None, cache: Mapping[str, Any]) -> None:
         jax.config.update(name, value)
 
 
-def _prepare(trials: NativeTrials, cell: Cell) -> None:
+def _prepare(trials: NativeTrials, cell: TrialSetup) -> None:
     """Compile, or read from disk, the JAX programs of a process's trials."""
     for program in trials.cell_programs(cell):
         finish = program.begin()
@@ -170,14 +170,14 @@ def _prepare(trials: NativeTrials, cell: Cell) -> None:
 
 
 def _row(
-    trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action, wanted: Bool[np.ndarray, "1 k"]
+    trials: NativeTrials, cell: TrialSetup, scenes: TrialScenes, actions: Action, wanted: Bool[np.ndarray, "1 k"]
 ) -> Int[np.ndarray, " k"]:
     """The results of the actions of a single scene."""
     return trials.in_cell(cell, scenes, actions, wanted)[0]
 
 
 def _ends(
-    trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action, arm_stop: float
+    trials: NativeTrials, cell: TrialSetup, scenes: TrialScenes, actions: Action, arm_stop: float
 ) -> Float[np.ndarray, "1 2 n 3"]:
     """Where the objects of a single scene come to rest."""
     return trials.ends_in_cell(cell, scenes, actions, arm_stop)

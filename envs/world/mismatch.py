@@ -150,11 +150,11 @@ class Mismatch:
     @property
     def simulates_otherwise(self) -> bool:
         """Whether the simulator has to differ from the usual."""
-        usual = ActualCell()
+        usual = TrueCell()
         alike = (self.friction, self.mass, self.physics, self.arm_stop) == (*usual[:3], usual.arm_stop)
         return self.moves_robot or not alike or max(self.friction_spread, self.mass_spread) > 1.0
 
-    def mould(self) -> Hashable:
+    def compile_key(self) -> Hashable:
         """A key of what is compiled: equal for mismatches that may share a batch."""
         has_holes = self.holes != "none"
         return self.moves_camera, self.resizes, self.measures_otherwise, self.colours_otherwise, has_holes
@@ -180,7 +180,7 @@ class Mismatch:
         if engine != "NativeSimulator" and self.arm_stop:
             raise InputError("--arm-stop: the batch simulator's arm never stops; add --simulator native")
 
-    def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> ActualCell:
+    def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> TrueCell:
         """The cell of an episode, constant until its end.
 
         Directions, axes, the bodies' shares of a spread and the seed of holes are drawn from what the scenario holds
@@ -202,7 +202,7 @@ class Mismatch:
         T_base_moved = _motion(
             self.camera_shift * camera_way, self.camera_turn * camera_axis, np.array(camera.position)
         )
-        return ActualCell(
+        return TrueCell(
             self.friction,
             self.mass,
             self.physics,
@@ -216,7 +216,7 @@ class Mismatch:
         )
 
 
-class ActualCell(NamedTuple):
+class TrueCell(NamedTuple):
     """The cell of one episode; by default as the planner assumes.
 
     Attributes:
@@ -243,7 +243,7 @@ class ActualCell(NamedTuple):
 
 # As the planner assumes.
 ASSUMED = Mismatch()
-ASSUMED_CELL = ActualCell()
+ASSUMED_CELL = TrueCell()
 
 
 def _motion(shift: np.ndarray, turn: np.ndarray, pivot: np.ndarray) -> Float[np.ndarray, "4 4"]:

@@ -32,7 +32,7 @@ from mechsearch_jax.robot.hand import (
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.robot_trajectory import derivatives
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.workspace.shelf import Shelf
@@ -132,7 +132,7 @@ def grip_for(problem: Setting, observation: Observation | None, action: Action) 
     return grip_of_any_yaw((x, y, 0.0), opening)
 
 
-@kept(static_argnames=("kind", "config"), on_host=True)
+@cached_jit(static_argnames=("kind", "config"), on_host=True)
 def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
     """`Kind.reference`, compiled: the motion of an action and whether the arm reaches all of it, or None.
 

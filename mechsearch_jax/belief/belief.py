@@ -24,7 +24,7 @@ from mechsearch_jax.images.measured import sampled
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import FoundGrasps, found_grasps, no_grasps
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.render import merge_windows
 from mechsearch_jax.workspace.target_view import body_at, main_body
@@ -56,7 +56,7 @@ class Belief(flax.struct.PyTreeNode):
     restarts: jax.Array
 
 
-@kept()
+@cached_jit()
 def initial_belief(problem: Problem) -> Belief:
     """The belief before the first observation: the target can be at every candidate pose."""
     config = problem.config.existence
@@ -73,7 +73,7 @@ def initial_belief(problem: Problem) -> Belief:
     )
 
 
-@kept()
+@cached_jit()
 def update_belief(
     problem: Problem,
     belief: Belief,
@@ -210,7 +210,7 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
     )
 
 
-@kept()
+@cached_jit()
 def sweeps_unmeasured(problem: Problem, belief: Belief, objects: Superquadrics, action: Action) -> Bool[Array, ""]:
     """Whether the hand, or the object that it moves, sweeps space in which something may stand that has no depth.
 
@@ -246,7 +246,7 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
     return everything, jnp.arange(everything.capacity) == objects.capacity
 
 
-@kept()
+@cached_jit()
 def graspability_map(problem: Problem, belief: Belief, objects: Superquadrics) -> Int[Array, " x"]:
     """g at every candidate pose, also where f is 0: 1, 0, -1, ... (section B.4), shape (X,)."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)

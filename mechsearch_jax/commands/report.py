@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mechsearch_jax.benchmarks.report.films import Draw
     from mechsearch_jax.benchmarks.report.report import Report
-    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
 
 def _columns(texts: Sequence[str]) -> tuple[str, ...]:
@@ -121,7 +121,7 @@ def _drawer(scenes: Sequence[str], status: Callable[[str], None]) -> Draw:
         scenario = load_scenario(file)
         by_name[scenario.name] = scenario
 
-    def draw(row: Row, file: Path) -> str:
+    def draw(row: EpisodeRow, file: Path) -> str:
         status(f"running {row.scenario} again, seed {row.seed}")
         return replay(row, by_name.get(row.scenario) or load_scenario(find_scenario(row.scenario)), file)
 

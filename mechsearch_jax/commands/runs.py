@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.report.console_tables import EpisodeProgress
     from mechsearch_jax.benchmarks.running.evaluate import Job, Runner
     from mechsearch_jax.benchmarks.running.planned import PlannedJob, SceneOutline
-    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.benchmarks.store.rows import EpisodeRow
     from mechsearch_jax.envs.simulators.named import EngineName
 
 
@@ -308,7 +308,7 @@ def run_jobs(
     out: Path,
     run: RunOptions,
     simulator: str,
-    print_results: Callable[[Console, Sequence[Row]], None],
+    print_results: Callable[[Console, Sequence[EpisodeRow]], None],
 ) -> None:
     """Run this machine's part of the jobs.
 

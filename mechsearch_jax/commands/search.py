@@ -50,7 +50,7 @@ class Generated:
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
+class OutputFiles:
     """What is written beside what is always.
 
     Attributes:
@@ -172,7 +172,7 @@ def search(
     decides: DecidedBy = USUAL_POLICY,
     seed: int = 0,
     out: Path,
-    keeps: Annotated[Kept, tyro.conf.arg(name="")] = Kept(),
+    keeps: Annotated[OutputFiles, tyro.conf.arg(name="")] = OutputFiles(),
     options: EpisodeOptions = DEFAULTS,
 ) -> None:
     """Run one episode: look, decide, act, until the target is found, graspable and taken out.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from mechsearch_jax.benchmarks.running.evaluate import Job
     from mechsearch_jax.benchmarks.running.planned import PlannedJob
-    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.benchmarks.store.rows import EpisodeRow
     from mechsearch_jax.benchmarks.studies.studies import Study
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.scenes.scene_sets import Block
@@ -62,7 +62,7 @@ def study(
         return
     jobs = _jobs(chosen, scenes, seeds, engine)
 
-    def show(console: Console, rows: Sequence[Row]) -> None:
+    def show(console: Console, rows: Sequence[EpisodeRow]) -> None:
         from mechsearch_jax.benchmarks.studies.comparison import screen
 
         for each in chosen:

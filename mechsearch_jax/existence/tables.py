@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.existence.config import ExistenceConfig
 from mechsearch_jax.geometry.transforms import transform, upright_pose
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
@@ -103,7 +103,7 @@ def _views_of_pieces(
     return jax.tree.map(lambda a: a[inverse].reshape(*shape, *a.shape[1:]), (views, first))
 
 
-@kept(static_argnames=("window",), on_host=True)
+@cached_jit(static_argnames=("window",), on_host=True)
 def _views_in_blocks(
     coarse: Camera,
     target: Target,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.cloud import View
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.detector import longer
 
@@ -24,7 +24,7 @@ def share_step(camera: Camera) -> int:
     return max(round(DOWNSCALE * longer(camera)), 1)
 
 
-@kept()
+@cached_jit()
 def measured_share(camera: Camera, view: View, depth: Float[Array, "h w"]) -> Float[Array, "rows columns"]:
     """The share of the pixels of each block of a camera's image that was measured, from a view of the image.
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mechsearch_jax.images.cloud import OVERHANG, View, above_board, shelf_view, surfaces, thinned_view
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.recogniser import Setting
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.parts import parts_of
 from mechsearch_jax.shapes.solid import Solid
@@ -232,7 +232,7 @@ def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndar
     )
 
 
-@kept()
+@cached_jit()
 def _surfaces(view: View, shelf: Shelf, depth: Array) -> tuple[Array, Array, Array]:
     """Points of a view, which of them stand on the shelf, and the numbers of their surfaces."""
     points = back_project(view.camera, jnp.where(measured(depth), depth, jnp.nan))

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.images.cloud import above_board, shelf_view, surfaces, thinned_view
 from mechsearch_jax.images.labels import INSTANCES, OTHER
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import longer
 from mechsearch_jax.workspace.shelf import Shelf
@@ -186,7 +186,7 @@ def _on_others(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.ndarray
     return f"{100 * share[worst]:.0f}% of number {worst} lies on other things, and is left out"
 
 
-@kept()
+@cached_jit()
 def on_own_surfaces(
     points: Float[Array, "h w 3"], instances: Int[Array, "h w"], standing: Bool[Array, "h w"]
 ) -> Int[Array, "h w"]:

@@ -38,7 +38,7 @@ from mechsearch_jax.perception.selection import (
     select_objects,
 )
 from mechsearch_jax.perception.solids import penetrations, surface_distance
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -142,7 +142,7 @@ def as_segmented(
     return Fitted(objects, pose, confidence_of(measures), measures, image.labels, jnp.zeros(SLOTS, bool))
 
 
-@kept()
+@cached_jit()
 def _measures_of_segments(
     key: Array, image: LabelledImage, objects: Superquadrics, error: Float[Array, " 8"], camera: Camera, shelf: Shelf
 ) -> Measures:
@@ -176,7 +176,7 @@ class Explaining:
         return explained_image(keys, image, shapes, camera, shelf, target, refinement, self.config, least)
 
 
-@kept(static_argnames=("target", "refinement", "config"))
+@cached_jit(static_argnames=("target", "refinement", "config"))
 def explained_image(
     keys: Key[Array, "2"],
     image: LabelledImage,

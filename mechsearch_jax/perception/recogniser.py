@@ -29,7 +29,7 @@ from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.own_settings import in_own_settings, own_settings
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
@@ -227,7 +227,7 @@ def _as_pytree(slot: Any) -> Any:
     return jax.tree_util.Partial(slot) if jax.tree_util.all_leaves([slot]) else slot
 
 
-@kept()
+@cached_jit()
 def _labelled(
     recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
 ) -> tuple[LabelledImage, Bool[Array, ""], Float[Array, "rows columns"]]:

@@ -19,7 +19,7 @@ from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -150,7 +150,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     of_target: jax.Array
 
 
-@kept(static_argnames=("target", "refinement"))
+@cached_jit(static_argnames=("target", "refinement"))
 def recognise_image(
     keys: Key[Array, "2"],
     image: LabelledImage,

@@ -32,10 +32,10 @@ from mechsearch_jax.planner.prediction import Predict, PredictByKind
 from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
-from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
+from mechsearch_jax.planner.trials import concatenate, grasps_to_try, sequences_to_try
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.retrieval import GraspChoice, best_grasp, worth_trying
-from mechsearch_jax.runtime.compiled import Kept, kept
+from mechsearch_jax.retrieval import GraspChoice, best_grasp, top_grasps
+from mechsearch_jax.runtime.compiled import CachedJit, cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
 
@@ -90,7 +90,7 @@ class PlanningPolicy(flax.struct.PyTreeNode):
 
     After trials a grasp that fails there is not made; see `trials.choose`.
 
-    It also implements `trials.AsksTwice`.
+    It also implements `trials.TwoStagePolicy`.
 
     Attributes:
       config: settings of the planner.
@@ -113,9 +113,9 @@ class PlanningPolicy(flax.struct.PyTreeNode):
         return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective)
 
     @property
-    def grasps(self) -> Kept:
-        """Ranks the grasps of a found target: `retrieval.worth_trying` where grasps are tried, else `best_grasp`."""
-        return worth_trying if self.tries else best_grasp
+    def grasps(self) -> CachedJit:
+        """Ranks the grasps of a found target: `retrieval.top_grasps` where grasps are tried, else `best_grasp`."""
+        return top_grasps if self.tries else best_grasp
 
     @property
     def _planning(self) -> PlanningPolicy:
@@ -135,12 +135,12 @@ class PlanningPolicy(flax.struct.PyTreeNode):
     def begin(
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
     ) -> Callable[[], None] | None:
-        """Lower the plan for such arguments without planning; see `runtime.compiled.Kept.begin`."""
+        """Lower the plan for such arguments without planning; see `runtime.compiled.CachedJit.begin`."""
         return _plan.begin(self._planning, key, *self._planned_with(problem, belief), observation)
 
     @in_own_settings
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
-        """Whether the plan for such arguments is compiled; see `runtime.compiled.Kept.is_ready`."""
+        """Whether the plan for such arguments is compiled; see `runtime.compiled.CachedJit.is_ready`."""
         return _plan.is_ready(self._planning, key, *self._planned_with(problem, belief), observation)
 
     @in_own_settings
@@ -201,20 +201,20 @@ def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
     """The planned decision, with grasps of the target before its own alternatives."""
     if grasp.alternatives is None or planned.alternatives is None:
         return planned
-    return planned.replace(alternatives=in_turn(grasp.alternatives, planned.alternatives))
+    return planned.replace(alternatives=concatenate(grasp.alternatives, planned.alternatives))
 
 
-@kept()
+@cached_jit()
 def _space(problem: Problem, belief: Belief) -> PossibleSpace:
     return possible_space(problem, belief, belief.exists)
 
 
-@kept()
+@cached_jit()
 def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
     return policy.plan(policy.rollout(problem, belief), key, observation.objects)
 
 
-@kept()
+@cached_jit()
 def _retrieval(policy: PlanningPolicy, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
     """The decision to take a found target out with a grasp (the first if there are several) if it hits nothing."""
     reached, objects = policy.objective.reached, observation.objects

@@ -51,7 +51,7 @@ class Propose(Protocol):
         ...
 
 
-class Weigh(Protocol):
+class ObjectWeights(Protocol):
     """Weighs the objects of a state for the draw of an action; static under jit."""
 
     def __call__(
@@ -69,7 +69,7 @@ class WeightedDraw:
       weigh: computes the weights.
     """
 
-    weigh: Weigh
+    weigh: ObjectWeights
 
     def __call__(
         self,
@@ -100,7 +100,7 @@ def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Ar
     return total / jnp.maximum(jnp.sum(total), 1e-12)
 
 
-def passed_on(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
+def propagate_blame(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
     """Pass the share of each object that cannot be moved yet on to the objects that its candidate actions hit.
 
     Repeated `DEPTH` times. The share of an object without any reachable candidate is lost.
@@ -137,7 +137,7 @@ def sampling_weights(
     blocks = blame(state.hits | (blocked[:, None] & target[None]), counts)
     blocks = jnp.where(jnp.any(counts), blocks, target)
     hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
-    share = passed_on(state, blocks + hides)
+    share = propagate_blame(state, blocks + hides)
     share = share / jnp.maximum(jnp.sum(share), 1e-12)
     return (1.0 - guided_fraction) / EVEN + guided_fraction * share
 

@@ -26,7 +26,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.state import Alternatives, Decision, Sequences
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 
 # Largest number of first actions of sequences that are tried; for grasps see `retrieval.TRIES`.
 TRIES = 8
@@ -92,7 +92,7 @@ class Trials(Protocol):
 
 
 @runtime_checkable
-class AsksTwice(Protocol):
+class TwoStagePolicy(Protocol):
     """A policy that decides in two steps, so that it plans only if the target is not taken out."""
 
     def retrieval(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
@@ -118,13 +118,13 @@ def decide(
     Planned actions are tried only if the target is not taken out.
 
     Args:
-      policy: see `policies.Policy`; one that `AsksTwice` plans only if no grasp succeeds.
+      policy: see `policies.Policy`; one that `TwoStagePolicy` plans only if no grasp succeeds.
       trials: tries the alternatives; None for no trials.
       key, problem, belief, observation: as for the policy.
       last: whether no further action is allowed; see `choose`.
     """
     arguments = (key, problem, belief, observation)
-    if trials is None or not isinstance(policy, AsksTwice):
+    if trials is None or not isinstance(policy, TwoStagePolicy):
         return tried(trials, problem, belief, observation, policy(*arguments), last)
     if belief.found:
         decision = tried(trials, problem, belief, observation, policy.retrieval(*arguments), last)
@@ -164,7 +164,7 @@ def grasps_to_try(actions: Action, worth: Bool[Array, " k"], now: Superquadrics,
     return Alternatives(actions, worth, sequence, now, jnp.float32(reached))
 
 
-@kept()
+@cached_jit()
 def sequences_to_try(sequences: Sequences, now: Superquadrics, reached: Float[Array, ""]) -> Alternatives:
     """The alternatives of the first actions of the best sequences, up to `TRIES` of them, no two alike.
 
@@ -205,7 +205,7 @@ def _alike(actions: Action, action: Action) -> Bool[Array, " s"]:
     return same & near[0] & near[1] & (cosine > math.cos(ALIKE_APPROACH))
 
 
-def in_turn(first: Alternatives, then: Alternatives) -> Alternatives:
+def concatenate(first: Alternatives, then: Alternatives) -> Alternatives:
     """Alternatives in order: `first`, and `then` after them."""
     actions, worth, sequence = jax.tree.map(
         lambda a, b: jnp.concatenate([a, b]),
@@ -215,7 +215,7 @@ def in_turn(first: Alternatives, then: Alternatives) -> Alternatives:
     return then.replace(actions=actions, worth=worth, sequence=sequence)
 
 
-@kept()
+@cached_jit()
 def choose(decision: Decision, results: Int[Array, " k"], last: Bool[Array, ""]) -> Decision:
     """Choose an action by the results of trials.
 

@@ -62,7 +62,7 @@ _TRACING = threading.RLock()
 
 
 def keep_in(folder: Path | None) -> None:
-    """Keep the executables of `kept` functions in a folder from now on; with None keep nothing.
+    """Keep the executables of `cached_jit` functions in a folder from now on; with None keep nothing.
 
     Those that this process has loaded from the folder stay loaded: each takes hundreds of the memory maps of which an
     operating system allows a process some ten thousand.
@@ -77,7 +77,7 @@ def kept_in() -> Path | None:
     return None if _KEEPING.executables is None else _KEEPING.executables.folder
 
 
-class Kept:
+class CachedJit:
     """A jitted function that can be compiled before it is called, and is looked up on disk before it is traced.
 
     A call uses the executable that `begin` or `prepare` made, or makes it. Inside other transformations, and for
@@ -281,8 +281,8 @@ class Kept:
         return lowered
 
 
-class KeptOnHost(Kept):
-    """A `Kept` function that runs on the host even if there is a GPU, except inside other transformations.
+class CachedJitOnHost(CachedJit):
+    """A `CachedJit` function that runs on the host even if there is a GPU, except inside other transformations.
 
     If there is a GPU, JAX's own cache keeps it on disk, for `Executables` are of the first device.
     """
@@ -294,12 +294,12 @@ class KeptOnHost(Kept):
             return super().__call__(*jax.device_get(args), **jax.device_get(kwargs))
 
     def begin(self, *args: Any, **kwargs: Any) -> Callable[[], None] | None:
-        """See `Kept.begin`."""
+        """See `CachedJit.begin`."""
         with on_host():
             return super().begin(*args, **kwargs)
 
     def is_ready(self, *args: Any, **kwargs: Any) -> bool:
-        """See `Kept.is_ready`."""
+        """See `CachedJit.is_ready`."""
         with on_host():
             return super().is_ready(*args, **kwargs)
 
@@ -319,9 +319,11 @@ def _compile(lowered: Any) -> Any:
     return lowered.compile()
 
 
-def kept(*, static_argnames: Sequence[str] = (), on_host: bool = False) -> Callable[[Callable[..., Any]], Kept]:
-    """A decorator in place of `jax.jit` for functions that take long to trace: `Kept`, or `KeptOnHost`."""
-    return lambda function: (KeptOnHost if on_host else Kept)(function, static_argnames)
+def cached_jit(
+    *, static_argnames: Sequence[str] = (), on_host: bool = False
+) -> Callable[[Callable[..., Any]], CachedJit]:
+    """A decorator in place of `jax.jit` for functions that take long to trace: `CachedJit`, or `CachedJitOnHost`."""
+    return lambda function: (CachedJitOnHost if on_host else CachedJit)(function, static_argnames)
 
 
 def _plain(leaf: Any) -> bool:

@@ -51,7 +51,7 @@ def program(name: str, function: Any, *args: Any) -> Program:
 
     Args:
       name: for progress messages.
-      function: a `runtime.compiled.Kept`, or an object with its `begin` and `is_ready`.
+      function: a `runtime.compiled.CachedJit`, or an object with its `begin` and `is_ready`.
       *args: of the call; arrays may be given as shapes.
     """
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))

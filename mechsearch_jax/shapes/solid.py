@@ -108,7 +108,7 @@ class Solid(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Whole:
+class SingleShape:
     """The `Solid` of a shape, with half-extents [m]."""
 
     shape: Shape

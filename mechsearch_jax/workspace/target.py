@@ -19,7 +19,7 @@ from mechsearch_jax.runtime.identity import Uncompared
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents
 from mechsearch_jax.shapes.meshes import LEAST_THICKNESS, thickness
-from mechsearch_jax.shapes.solid import Solid, Union, Whole
+from mechsearch_jax.shapes.solid import SingleShape, Solid, Union
 from mechsearch_jax.workspace.compound_file import format_compound, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target_data import TargetData, target_data
@@ -209,7 +209,7 @@ class Target:
     def solid(self) -> Solid:
         """Its geometry."""
         assert self.traced is None, "inside of a program a target of pieces is data"
-        return Union(self.compound) if self.compound else Whole(shape_of(self.shape), self.half_size)
+        return Union(self.compound) if self.compound else SingleShape(shape_of(self.shape), self.half_size)
 
     @property
     def is_compound(self) -> bool:

@@ -270,13 +270,13 @@ def weights(kept):
 def report(kept):
     """What is written of a few episodes whose wall times are made up."""
     from mechsearch_jax.benchmarks.report.report_files import write_report
-    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.benchmarks.store.rows import EpisodeRow
     from mechsearch_jax.workspace.scenario import example_scenarios
 
     rows = []
     for file in example_scenarios().values():
         for method in ("search-for-grasp", "search-and-grasp"):
-            row = Row.of_episode(run_episode(file, method, "oracle"))
+            row = EpisodeRow.of_episode(run_episode(file, method, "oracle"))
             rows.append(dataclasses.replace(row, planning_seconds=1.0, simulation_seconds=2.0))
     with tempfile.TemporaryDirectory() as folder:
         write_report(rows, Path(folder))

@@ -39,7 +39,7 @@ from mechsearch_jax.perception.parts.unions import (
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import FAR, RefinementConfig, refine, select
 from mechsearch_jax.perception.selection import check_numbers
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -115,7 +115,7 @@ class InParts:
         return in_parts(image, fitted, camera, shelf, self.config, self.joining)
 
 
-@kept(static_argnames=("config", "joining"))
+@cached_jit(static_argnames=("config", "joining"))
 def in_parts(
     image: LabelledImage,
     fitted: Fitted,

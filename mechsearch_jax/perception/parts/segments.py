@@ -19,7 +19,7 @@ from mechsearch_jax.perception.hypotheses import SLOTS, bordering, connected
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import check_numbers
-from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -76,7 +76,7 @@ class Connected:
         return self.of(keys, image.replace(labels=labels), shapes, camera, shelf, target, refinement, least)
 
 
-@kept(static_argnames=("config",))
+@cached_jit(static_argnames=("config",))
 def connected_segments(
     points: Float[Array, "h w 3"],
     labels: Int[Array, "h w"],

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -15,7 +15,7 @@ from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.workspace.target import Target
 
 
-class InTurn:
+class SequentialRunner:
     """A `Runner` of one episode at a time, in the native simulator; keeps what episodes have in common."""
 
     def __init__(self) -> None:
@@ -24,21 +24,21 @@ class InTurn:
         self._policy = functools.cache(Method.policy)
 
     def __call__(
-        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[EpisodeRow]], None], begin: Callable[[Job], bool]
     ) -> None:
         """Run all jobs; see `evaluate.Runner`."""
         for job in jobs:
             if begin(job):
                 ended([self.row(job)])
 
-    def row(self, job: Job) -> Row:
+    def row(self, job: Job) -> EpisodeRow:
         """The row of a job, with the reason where its episode fails."""
         try:
             return self.run(job)
         except Exception as error:  # Whatever fails in one episode must not end the run.
             return job.failed_by(error)
 
-    def run(self, job: Job) -> Row:
+    def run(self, job: Job) -> EpisodeRow:
         """Run one episode.
 
         Raises:
@@ -54,7 +54,7 @@ class InTurn:
             self._simulator(workcell),
             run_settings(method, target),
         )
-        return Row.of_episode(episode, present_code())
+        return EpisodeRow.of_episode(episode, present_code())
 
 
 def run_settings(method: Method, target: Target) -> RunSettings:
