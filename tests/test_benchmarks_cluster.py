@@ -157,6 +157,7 @@ def without_times(rows):
     return [dataclasses.replace(row, **dict.fromkeys(CLOCKED, 0.0)) for row in rows]
 
 
+@pytest.mark.slow
 def test_every_job_becomes_one_row_and_no_file_is_needed(ray, tmp_path):
     jobs = jobs_of(tmp_path, "one", "two", "three", seeds=range(4))
     for job in jobs:

@@ -336,4 +336,6 @@ def test_a_decision_simulates_all_its_pushes_in_the_batch_simulator(problem):
     )
     assert (plan.sequences.actions.kind[:, 0] == native.sequences.actions.kind[:, 0]).all()
     assert np.isfinite(plan.value)
-    np.testing.assert_allclose(plan.value, native.value, rtol=0.1)
+    # Of the sequences that follow, the engines' ends differ by millimetres, in which f counts other poses.
+    np.testing.assert_allclose(plan.predicted.position, native.predicted.position, atol=2e-3)
+    np.testing.assert_allclose(plan.predicted_cost, native.predicted_cost, rtol=0.01)

@@ -105,6 +105,7 @@ def same(a, b):
 
 @quick
 @given(seeds)
+@pytest.mark.slow
 def test_one_part_changes_no_hit_view_or_footprint(seed):
     scene = single(seed)
     split = with_parts(scene, bodies.PARTS)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -99,6 +100,7 @@ def test_an_absent_body_is_joined_to_nothing_and_nothing_to_it():
 
 @settings(deadline=None, max_examples=10)
 @given(st.lists(st.tuples(st.floats(0.0, 0.3), st.floats(0.0, 0.2)), min_size=3, max_size=3))
+@pytest.mark.slow
 def test_eager_compiled_and_batched_agree(places):
     arguments = cubes(*places)
     eager = join_floating(*arguments, BOARD)

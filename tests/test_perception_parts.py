@@ -126,6 +126,7 @@ def test_a_scene_of_boxes_and_cylinders_is_the_same_with_and_without_parts():
     assert not only.position.any()
 
 
+@pytest.mark.slow
 def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
     """A bottle whose neck is a segment of its own: with `join_floating` both are one body, else each has a slot."""
     image, view, _ = seen(thing("wine-bottle", 0.55, -0.05))

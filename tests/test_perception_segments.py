@@ -89,6 +89,7 @@ def test_what_is_no_segment_stays_what_it_is():
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 2**31 - 1))
+@pytest.mark.slow
 def test_pieces_are_those_of_a_reference_and_compiled_and_batched_agree(seed):
     """With no joining, segments are the connected components of each label, which SciPy finds."""
     rng = np.random.default_rng(seed)
@@ -119,6 +120,7 @@ def test_bad_settings_are_refused():
             SegmentsConfig(**wrong)
 
 
+@pytest.mark.slow
 def test_each_household_thing_of_a_shelf_has_one_segment():
     """A drill, a bottle, a carton and a spray bottle, of which the network alone makes eight segments."""
     world = from_scenario(make_scene(*find_scene("household-4-162")))
