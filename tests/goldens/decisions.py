@@ -95,7 +95,7 @@ def _alike(old, new):
     return abs(old - new) <= SHARE * old if isinstance(old, int) and old > 10 else old == new
 
 
-def cached_jit():
+def kept():
     """The number of the kept decisions, and these."""
     value = json.loads(FILE.read_text())
     return value["decision_version"], value["decisions"]
