@@ -242,7 +242,7 @@ def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, 
     return table
 
 
-def scenes_table(rows: Sequence[scenes.EpisodeRow]) -> Group:
+def scenes_table(rows: Sequence[scenes.Row]) -> Group:
     """What scenes are like: a row for each source and number of objects."""
     table = plain_table("scenes at their start")
     table.add_column("source", no_wrap=True)
@@ -275,7 +275,7 @@ def scenes_table(rows: Sequence[scenes.EpisodeRow]) -> Group:
     return Group(table, Text(explanation, style="dim"), *map(Text, beside_exact))
 
 
-def reach_table(rows: Sequence[reach.EpisodeRow]) -> Group:
+def reach_table(rows: Sequence[reach.Row]) -> Group:
     """Where a target alone on the shelf can be grasped: a row for each band across it."""
     table = plain_table("grasps of a target alone on the shelf, from its right wall to its left one")
     for name in ("y [m]", "poses", "graspable", "hand", "reached", "feasible", "approaches"):

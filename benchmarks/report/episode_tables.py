@@ -143,7 +143,7 @@ def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
     return table
 
 
-def ceiling_table(rows: Sequence[solvability.EpisodeRow]) -> Group:
+def ceiling_table(rows: Sequence[solvability.Row]) -> Group:
     """What share of scenes can be solved: a row for each number of objects; and below it why the others were not."""
     table = plain_table("scenes that can be solved at all")
     for name in ("objects", "scenes", "in an episode", "by the search", "solvable", "95% interval"):
