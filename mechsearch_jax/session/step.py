@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.actions.sketch import Sketch
@@ -25,8 +24,13 @@ from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.step_json import step_json
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
-from mechsearch_jax.viz.filmstrip import Frame, filmstrip
 from mechsearch_jax.workspace.camera import measured
+
+# Drawing takes as long to import as a third of all else; who draws nothing does not wait for it.
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mechsearch_jax.viz.filmstrip import Frame
 
 # Why no motion is made that would sweep space in which something may stand that has no depth.
 UNMEASURED = (
@@ -72,6 +76,8 @@ class SearchStep:
     @functools.cached_property
     def frame(self) -> Frame:
         """The step as `viz.filmstrip.filmstrip` draws it, alone or beside others."""
+        from mechsearch_jax.viz.filmstrip import Frame
+
         objects, after = (jax.tree.map(np.asarray, s) for s in (self.observation.objects, self.decision.predicted))
         action, found = self.decision.action, bool(self.belief.found)
         kind, moves = kind_of(int(action.kind)), self.trajectory is not None
@@ -93,6 +99,8 @@ class SearchStep:
     @functools.cached_property
     def picture(self) -> Figure:
         """The image, f and g from above, and the action."""
+        from mechsearch_jax.viz.filmstrip import filmstrip
+
         heading = "; ".join(self.warnings) or "What the robot sees, and what it is to do"
         return filmstrip([self.frame], self.problem.camera, self.problem.shelf, self.problem.target, heading)
 
