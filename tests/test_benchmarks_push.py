@@ -12,8 +12,9 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.parts import bench, push
-from mechsearch_jax.benchmarks.parts.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.lab.parts import push
+from mechsearch_jax.benchmarks.lab.parts.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.parts import bench
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.pushing import pushes as generator

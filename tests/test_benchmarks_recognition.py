@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure, recognition_methods
-from mechsearch_jax.benchmarks.parts.recognition import Bench, Row
-from mechsearch_jax.benchmarks.parts.recognition_methods import Method
+from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure, recognition_methods
+from mechsearch_jax.benchmarks.lab.parts.recognition import Bench, Row
+from mechsearch_jax.benchmarks.lab.parts.recognition_methods import Method
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands.bench import quality
 from mechsearch_jax.envs.world.world import true_superquadrics

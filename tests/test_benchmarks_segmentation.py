@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mechsearch_jax.benchmarks.parts import images, segmentation
-from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps, true_masks
+from mechsearch_jax.benchmarks.lab.parts import images, segmentation
+from mechsearch_jax.benchmarks.lab.parts.segmentation import Bench, overlaps, true_masks
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError

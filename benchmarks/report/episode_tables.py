@@ -10,7 +10,6 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks.ceiling import solvability
 from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
@@ -141,26 +140,6 @@ def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
             style="bold" if events.objects is None else None,
         )
     return table
-
-
-def ceiling_table(rows: Sequence[solvability.Row]) -> Group:
-    """What share of scenes can be solved: a row for each number of objects; and below it why the others were not."""
-    table = plain_table("scenes that can be solved at all")
-    for name in ("objects", "scenes", "in an episode", "by the search", "solvable", "95% interval"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for line in solvability.summary(rows):
-        low, high = line["solvable_interval"]
-        table.add_row(
-            "all" if line["objects"] is None else str(line["objects"]),
-            str(line["scenes"]),
-            str(line["solved_in_an_episode"]),
-            str(line["solved_by_the_search"]),
-            f"{line['solvable']:.2f}",
-            f"{low:.2f} to {high:.2f}",
-            style="bold" if line["objects"] is None else None,
-        )
-    reasons = [Text(f"{row.scenario}: {row.reason}") for row in rows if not row.solvable]
-    return Group(table, *reasons)
 
 
 def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
