@@ -62,7 +62,7 @@ def test_targets_stand_at_free_places():
 
 def test_targets_of_different_shapes_are_refused():
     for scenarios in ([], [CYLINDER, BOX]):
-        with pytest.raises(InputError, match="bench detection: give scenarios"):
+        with pytest.raises(InputError, match="lab detection: give scenarios"):
             detection_figures(scenarios)
 
 

@@ -6,10 +6,10 @@ import random
 import pytest
 from stored_rows import row_of
 
+from mechsearch_jax.benchmarks.lab.commands import study as command
 from mechsearch_jax.benchmarks.lab.studies.comparison import compare, screen, sentence
 from mechsearch_jax.benchmarks.lab.studies.declared import GROUPS, STUDIES
 from mechsearch_jax.benchmarks.lab.studies.studies import Study, Variant, find_studies
-from mechsearch_jax.commands import study as command
 from mechsearch_jax.commands.main import parse
 from mechsearch_jax.envs.scenes.scene_sets import SETS, SHELVES, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError

@@ -29,5 +29,10 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     return call_of(PROGRAM, "Measure the parts, and compare variants, one command each.", COMMANDS, arguments)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """The program."""
     run(parse)
+
+
+if __name__ == "__main__":
+    main()

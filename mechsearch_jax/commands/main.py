@@ -167,9 +167,7 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     return call_of(program, description, commands, rest)
 
 
-def call_of(
-    program: str, description: str | None, commands: Commands, arguments: Sequence[str]
-) -> Callable[[], None]:
+def call_of(program: str, description: str | None, commands: Commands, arguments: Sequence[str]) -> Callable[[], None]:
     """The one of a program's commands that is named first, with its arguments, ready to be called.
 
     Raises:

@@ -240,6 +240,7 @@ def bench_segmentation(
 
     from mechsearch_jax.benchmarks.lab.parts import images, segmentation
     from mechsearch_jax.benchmarks.lab.tables.parts_tables import segmentation_tables
+    from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("lab segmentation", worst=worst)
@@ -254,7 +255,7 @@ def bench_segmentation(
         status.update("compiling")
         measured = bench.run(lambda done: status.update(f"segmenting {done}/{total}"))
         if out is not None:
-            images.save_rows(measured.value(), measured.rows, out)
+            save_rows(measured.value(), measured.rows, out)
         if picture is not None:
             status.update("drawing")
             save_figure(segmentation.worst_figure(bench, measured.rows, worst), picture)

@@ -29,9 +29,7 @@ def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
     """
     ranked = sorted((row for row in rows if row.method == method), key=lambda row: row.iou)
     if not ranked or count < 1:
-        raise InputError(
-            f"lab recognition: there are no {count} answers of {method} to draw; measure it, count from 1"
-        )
+        raise InputError(f"lab recognition: there are no {count} answers of {method} to draw; measure it, count from 1")
     return ranked[:count]
 
 

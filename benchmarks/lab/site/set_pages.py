@@ -38,7 +38,7 @@ _WORDS = {
 
 # What most runs simulated with; a label names another one.
 _USUAL_SIMULATOR = "MjxSimulator"
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(__file__).parents[3]
 
 Line = Mapping[str, Any]
 
