@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -250,7 +251,7 @@ WRONG = {
 def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, capsys, arguments, message):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     monkeypatch.chdir(folder)
-    program, arguments = (lab, arguments[1:]) if arguments[0] == "lab" else (cli, arguments)
+    program, arguments = (lab, arguments[1:]) if arguments[:1] == ["lab"] else (cli, arguments)
     monkeypatch.setattr(sys, "argv", ["mechsearch", *arguments])
     with pytest.raises(SystemExit) as end:
         program.main()

@@ -40,7 +40,7 @@ def study(
 
     Args:
       names: of studies: gamma, horizon, sequences, actions, extensions, push-model, steps, recognition,
-        friction-learned, images, first-actions, baselines, friction, friction-without-trials, mass, friction-and-mass,
+        friction-learned, images, baselines, friction, friction-without-trials, mass, friction-and-mass,
         calibration, sensor, cameras, shelf-low, shelf-narrow, shelf-wide, physics; or all.
       out: folder for the results, one row for each episode.
       scenes: only the first so many of each number of objects, for a quick look.

@@ -9,9 +9,9 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.lab.studies.outcomes import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.lab.studies.studies import Study, Variant
-from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval, with_interval
+from mechsearch_jax.benchmarks.statistics.intervals import with_interval
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.rates import actions_of, scene_of
+from mechsearch_jax.benchmarks.statistics.rates import actions_of
 from mechsearch_jax.benchmarks.store.rows import Row
 
 # What is compared, by the words of tables: a number for each episode, or None where its row does not say.
@@ -31,18 +31,14 @@ class Comparison:
       episodes: how many.
       errors: how many of the episodes could not be run to their end; they count as failures.
       means: of each of `MEASURES` over episodes; None where no row says it.
-      intervals: their 95% intervals, by scene: see `intervals`; None where there is none.
       changes: how much more than the first variant, over the scenes and seeds that both have; empty for the first.
-      decision_seconds: mean wall time of planning for an action, on the device that ran the rows [s].
     """
 
     variant: Variant
     episodes: int
     errors: int
     means: Mapping[str, float | None]
-    intervals: Mapping[str, Interval | None]
     changes: Mapping[str, PairedDifference]
-    decision_seconds: float
 
 
 def compare(study: Study, rows: Sequence[Row]) -> list[Comparison]:
@@ -57,23 +53,17 @@ def compare(study: Study, rows: Sequence[Row]) -> list[Comparison]:
 
 
 def _comparison(variant: Variant, rows: Sequence[Row], base: Sequence[Row]) -> Comparison:
-    means, intervals = {}, {}
+    means = {}
     pairs = same_episodes(rows, base)
     for name, measure in MEASURES.items():
-        ends = [(value, scene_of(row)) for row in rows if (value := measure(row)) is not None]
-        values, scenes = [value for value, _ in ends], [scene for _, scene in ends]
+        values = [value for row in rows if (value := measure(row)) is not None]
         means[name] = sum(values) / len(values) if values else None
-        interval = share_interval(list(map(bool, values)), scenes) if name in SHARES else mean_interval(values, scenes)
-        intervals[name] = interval if values else None
-    actions = max(sum(row.steps for row in rows), 1)
     return Comparison(
         variant,
         len(rows),
         sum(row.is_error for row in rows),
         means,
-        intervals,
         {name: change_of(pairs, measure) for name, measure in MEASURES.items()} if pairs else {},
-        sum(row.planning_seconds for row in rows) / actions,
     )
 
 
@@ -116,23 +106,6 @@ def sentence(study: Study, comparisons: Sequence[Comparison]) -> str:
 
 def listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
-HEADER = ("variant", "episodes", *SHARES, "actions", "retrieved, change", "graspable, change", "actions, change")
-
-
-def cells(comparison: Comparison) -> list[str]:
-    """The cells of a variant under `HEADER`."""
-    errors = f", {comparison.errors} errors" if comparison.errors else ""
-    line = [comparison.variant.label, f"{comparison.episodes}{errors}"]
-    for name in SHARES:
-        line.append(with_interval(comparison.means[name], comparison.intervals[name], "{:.2f}"))
-    line.append(with_interval(comparison.means["actions"], None, "{:.1f}"))
-    if not comparison.changes:
-        return [*line, "", "", ""]
-    actions = comparison.changes["actions"]
-    shares = [points(comparison.changes[name]) for name in ("retrieved", "graspable")]
-    return [*line, *shares, with_interval(actions.mean, actions.interval, "{:+.1f}")]
 
 
 def screen(study: Study, rows: Sequence[Row]) -> Table:

@@ -14,7 +14,6 @@ from mechsearch_jax.benchmarks.lab.studies.studies import Study, Variant
 from mechsearch_jax.envs.world.mismatch import Mismatch
 
 ABLATION_SCENES = "development"
-DEFAULT_SCENES = "report-d"
 STANDARD = Variant("standard")
 # Where policies to compare with are that no command has a name for.
 POLICIES = "mechsearch_jax.benchmarks.policies"
@@ -26,7 +25,7 @@ def _degrees(*angles: int) -> tuple[float, ...]:
 
 def _values(option: str, values: Sequence[int | float], **others: Any) -> tuple[Variant, ...]:
     """A variant for each value of an option of the planner, the default's first."""
-    return tuple(Variant(f"{option} {value:g}", {option: value, **others}, value=float(value)) for value in values)
+    return tuple(Variant(f"{option} {value:g}", {option: value, **others}) for value in values)
 
 
 _ABLATIONS = (
@@ -35,14 +34,12 @@ _ABLATIONS = (
         "Does the discount of later actions matter?",
         ABLATION_SCENES,
         _values("gamma", (0.9, 0.5, 0.6, 0.7, 0.8, 1.0)),
-        axis="gamma",
     ),
     Study(
         "horizon",
         "How many actions ahead should be planned?",
         ABLATION_SCENES,
         _values("horizon", (3, 1, 2, 4, 5)),
-        axis="actions in a sequence, M",
     ),
     Study(
         "sequences",
@@ -51,9 +48,8 @@ _ABLATIONS = (
         (
             *_values("sequences", (30, 10, 100, 300, 1000)),
             # 100 scenes.
-            Variant("sequences 3000", {"sequences": 3000}, value=3000.0, scenes=25),
+            Variant("sequences 3000", {"sequences": 3000}, scenes=25),
         ),
-        axis="sequences",
     ),
     Study(
         "actions",
@@ -129,8 +125,6 @@ _ABLATIONS = (
     ),
 )
 
-_FULL = {"recognition": "full"}
-_THREE_AHEAD = {"horizon": 3, "sequences": 30, "move_target": True}
 
 _CONFIRMATIONS = (
     Study(
@@ -141,22 +135,6 @@ _CONFIRMATIONS = (
             Variant("oracle"),
             Variant("masks", {"recognition": "masks"}),
             Variant("full", {"recognition": "full"}),
-        ),
-    ),
-)
-
-_ONE_AHEAD_STUDIES = (
-    Study(
-        "first-actions",
-        "How many first actions are worth comparing, and how far ahead, where the eight that are tried differ?",
-        DEFAULT_SCENES,
-        (
-            Variant("100, full", _FULL),
-            Variant("300, full", {**_FULL, "sequences": 300}),
-            Variant("30 of three actions, full", {**_FULL, **_THREE_AHEAD}),
-            Variant("100, true shapes"),
-            Variant("300, true shapes", {"sequences": 300}),
-            Variant("30 of three actions, true shapes", _THREE_AHEAD),
         ),
     ),
 )
@@ -190,10 +168,10 @@ def _by_name(*groups: Sequence[Study]) -> dict[str, Study]:
     return {study.name: study for group in groups for study in group}
 
 
-# By what they are for, in the order of the page.
+# By what they are for, in the order of the docs.
 GROUPS: Mapping[str, Sequence[Study]] = {
     "Ablations": _ABLATIONS,
-    "On new scenes": (*_CONFIRMATIONS, *_ONE_AHEAD_STUDIES),
+    "On new scenes": _CONFIRMATIONS,
     "Baselines": _BASELINES,
     "Robustness": ROBUSTNESS,
 }

@@ -20,13 +20,13 @@ def _in_worlds(worlds: Mapping[str, Mismatch], engine: EngineName | None = None,
     return tuple(Variant(label, {**options, "mismatch": world}, engine=engine) for label, world in worlds.items())
 
 
-def _by_factor(name: str, question: str, axis: str, world: Callable[[float], Mismatch], **options: Any) -> Study:
+def _by_factor(name: str, question: str, world: Callable[[float], Mismatch], **options: Any) -> Study:
     """What if a property of the world, the first word of the study's name, is a multiple of what it is taken to be."""
     variants = tuple(
-        Variant(f"{name.partition('-')[0]} x {factor:g}", {**options, "mismatch": world(factor)}, value=factor)
+        Variant(f"{name.partition('-')[0]} x {factor:g}", {**options, "mismatch": world(factor)})
         for factor in (1.0, 0.5, 0.7, 1.4, 2.0)
     )
-    return Study(name, question, REPORT_SCENES, variants, axis=axis)
+    return Study(name, question, REPORT_SCENES, variants)
 
 
 _USUAL_WORLD = {"as assumed": Mismatch()}
@@ -72,20 +72,17 @@ ROBUSTNESS: tuple[Study, ...] = (
     _by_factor(
         "friction",
         "What if friction is not what trials assume?",
-        "true friction as a multiple of what trials assume",
         lambda factor: Mismatch(friction=factor),
     ),
     _by_factor(
         "friction-without-trials",
         "What if friction is not as usual, and nothing is tried out?",
-        "true friction as a multiple of the usual",
         lambda factor: Mismatch(friction=factor),
         rehearsal="none",
     ),
     _by_factor(
         "mass",
         "What if masses are not what trials assume?",
-        "true masses as a multiple of what trials assume",
         lambda factor: Mismatch(mass=factor),
     ),
     Study(

@@ -34,7 +34,6 @@ class Variant:
       options: how it differs from `search-for-grasp` in preset `standard` with true shapes: the planner's options by
         name, `preset`, and fields of `Method` (`recognition`, `mismatch`).
       policy: its name.
-      value: its place on the study's axis, where that is a number.
       config: a configuration file of another camera; the default one's settings if None.
       engine: the simulator that it needs; any if None.
       scenes: only the first so many of each number of objects; all if None.
@@ -43,7 +42,6 @@ class Variant:
     label: str
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     policy: str = "search-for-grasp"
-    value: float | None = None
     config: Path | None = None
     engine: EngineName | None = None
     scenes: int | None = None
@@ -69,14 +67,12 @@ class Study:
       question: in one sentence.
       scenes: name of a scene set.
       variants: the first is what the others are compared with.
-      axis: what `Variant.value` is, in words and with its unit; None where variants are not on an axis.
     """
 
     name: str
     question: str
     scenes: str
     variants: tuple[Variant, ...]
-    axis: str | None = None
 
     @property
     def baseline(self) -> Variant:
