@@ -1,4 +1,4 @@
-"""Images of scenes for `benchmarks.looks.looks`: MuJoCo casts the rays, colours are those of recognition `full`."""
+"""Images of scenes for `benchmarks.lab.looks.looks`: MuJoCo casts the rays, colours are those of recognition `full`."""
 
 from __future__ import annotations
 
