@@ -1,4 +1,4 @@
-"""Results on the screen: timings, scores, and the progress of many episodes."""
+"""Results on the screen: timings, scene sets, and the progress of many episodes."""
 
 from __future__ import annotations
 

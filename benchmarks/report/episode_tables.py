@@ -1,4 +1,4 @@
-"""Results of whole episodes on the screen: rates by variant, what share of scenes can be solved, what a suite lost."""
+"""Results of whole episodes on the screen: rates by variant, and what a suite lost."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
 from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
-from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
+from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 from mechsearch_jax.benchmarks.store.rows import Row
 
@@ -34,11 +34,6 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
             console.print(f"{short}  {label}", soft_wrap=True)
     elif key.common:
         console.print(f"all {key.common}", style="dim", soft_wrap=True)
-
-
-def rates_table(rows: Sequence[Row]) -> Table:
-    """Rates of success by variant and number of objects; see `summary_table`."""
-    return summary_table(summarise(rows), Key.of(rows))
 
 
 def summary_table(summary: Sequence[Rates], key: Key) -> Table:
@@ -117,12 +112,6 @@ def differences_table(differences: VariantDifferences, key: Key, baseline: str) 
             cells.append("-" if change.mean is None else f"{100 * change.mean:+.1f}{error}")
         table.add_row(escape(key.short[label]), str(goals["found"].pairs), *cells)
     return table
-
-
-def events_table(rows: Sequence[Row]) -> Table | None:
-    """What happened on the way, by variant and number of objects; None where no row says it."""
-    summary = summarise_events(rows)
-    return events_summary_table(summary, Key.of(rows)) if summary else None
 
 
 def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
