@@ -27,6 +27,7 @@ def check_package(version: str) -> Path:
     assert installed == version, f"version {installed} is installed, not {version}"
     folder = Path(mechsearch_jax.__file__).parent
     assert folder.parent == Path(sysconfig.get_path("purelib")), f"{folder} is not the installed package"
+    assert not (folder / "benchmarks" / "lab").exists(), "what belongs to a checkout is installed, too"
     for name in mechsearch_jax.__all__:
         getattr(mechsearch_jax, name)
     return folder

@@ -31,6 +31,11 @@ import runtime_checks  # noqa: E402
 # Has to happen before the package is imported, and so before everything else.
 runtime_checks.install("mechsearch_jax")
 
+import mechsearch_jax.benchmarks  # noqa: E402
+
+# Where the package is installed, the lab is not: its tests are of this checkout's.
+mechsearch_jax.benchmarks.__path__.append(str(Path(__file__).parents[1] / "benchmarks"))
+
 import jax  # noqa: E402
 import pytest  # noqa: E402
 import shares  # noqa: E402

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.parts import simulation
-from mechsearch_jax.benchmarks.parts.agreement import (
+from mechsearch_jax.benchmarks.lab.parts.agreement import (
     Agreement,
     Case,
     agreement,
     draw_actions,
     pose_differences,
 )
-from mechsearch_jax.benchmarks.report.console_tables import agreement_table
+from mechsearch_jax.benchmarks.lab.tables.parts_tables import agreement_table
+from mechsearch_jax.benchmarks.parts import simulation
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario

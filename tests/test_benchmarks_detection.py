@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.detection.detection import (
+from mechsearch_jax.benchmarks.lab.detection.detection import (
     COLOURS,
     Condition,
     Looks,
@@ -12,7 +12,7 @@ from mechsearch_jax.benchmarks.detection.detection import (
     total,
     worlds_of,
 )
-from mechsearch_jax.benchmarks.report.console_tables import detection_table
+from mechsearch_jax.benchmarks.lab.tables.parts_tables import detection_table
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
@@ -62,7 +62,7 @@ def test_targets_stand_at_free_places():
 
 def test_targets_of_different_shapes_are_refused():
     for scenarios in ([], [CYLINDER, BOX]):
-        with pytest.raises(InputError, match="bench detection: give scenarios"):
+        with pytest.raises(InputError, match="lab detection: give scenarios"):
             detection_figures(scenarios)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.benchmarks.parts import ems
+from mechsearch_jax.benchmarks.lab.parts import ems
 from mechsearch_jax.geometry.superquadric import Superquadrics, sample_surface
 from mechsearch_jax.perception import scores
 from mechsearch_jax.runtime.errors import InputError

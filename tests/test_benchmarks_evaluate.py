@@ -15,11 +15,12 @@ from rich.console import Console
 from scripted import is_gone, one_by_one, run
 
 from mechsearch_jax.benchmarks.report import console_tables
-from mechsearch_jax.benchmarks.report.episode_tables import rates_table
+from mechsearch_jax.benchmarks.report.episode_tables import summary_table
 from mechsearch_jax.benchmarks.running import evaluate as benchmark
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code, shard_of
 from mechsearch_jax.benchmarks.running.processes import Processes
 from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.benchmarks.store.rows import episode_key, identity
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results
 from mechsearch_jax.envs.episode.method import Method
@@ -262,7 +263,7 @@ def test_progress_and_rates_are_shown(tmp_path, files):
     with console_tables.EpisodeProgress(console, 3) as progress:
         jobs = make_jobs(files[:3], [Method()], (0,))
         rows = evaluate(jobs, tmp_path / "rows", one_by_one, ended=progress.ended)
-    console.print(rates_table(rows))
+    console.print(summary_table(summarise(rows), Key.of(rows)))
     text = screen.getvalue()
     assert "3/3 raise: error: ValueError: no" in text
     everything = next(line for line in text.splitlines() if " all " in line)

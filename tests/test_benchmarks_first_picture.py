@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from recordings import EPISODE, FOUND, LOST, RECORDING, step
 
-from mechsearch_jax.benchmarks.site.first_picture import FEWEST, MOST, OUT, POLICIES, SCENE, both, check_search
+from mechsearch_jax.benchmarks.lab.site.first_picture import FEWEST, MOST, OUT, POLICIES, SCENE, both, check_search
 from mechsearch_jax.commands.options import find_scenario
 from mechsearch_jax.runtime.errors import InputError
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.looks import looks, pictures, scoring
-from mechsearch_jax.benchmarks.looks.scoring import failure_kind, gaps, matched, phantom_kind, turned_by
+from mechsearch_jax.benchmarks.lab.looks import looks, pictures, scoring
+from mechsearch_jax.benchmarks.lab.looks.scoring import failure_kind, gaps, matched, phantom_kind, turned_by
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.mismatch import USUAL_COLOUR_NOISE, USUAL_HUE_GAP

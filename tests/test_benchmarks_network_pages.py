@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mechsearch_jax.benchmarks.site import network_pages
+from mechsearch_jax.benchmarks.lab.site import network_pages
 from mechsearch_jax.networks.weights import ARCHITECTURES
 from mechsearch_jax.runtime.errors import InputError
 

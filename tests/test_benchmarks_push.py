@@ -12,8 +12,11 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.parts import bench, push
-from mechsearch_jax.benchmarks.parts.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.lab import __main__ as lab
+from mechsearch_jax.benchmarks.lab.parts import push
+from mechsearch_jax.benchmarks.lab.parts.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.lab.tables import parts_tables
+from mechsearch_jax.benchmarks.parts import bench
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.pushing import pushes as generator
@@ -91,7 +94,7 @@ def test_impossible_pushes_are_refused(wrong):
 
 @pytest.mark.parametrize("wrong", [{"rows": ()}, {"rows": ("guess",)}, {"rows": ("nudged",), "weights": "push.npz"}])
 def test_impossible_comparisons_are_refused(wrong):
-    with pytest.raises(InputError, match="bench push"):
+    with pytest.raises(InputError, match="lab push"):
         Bench(GENERATION, **wrong)
 
 
@@ -239,7 +242,7 @@ def rows_of(table):
 def test_the_tables_show_every_model_and_the_groups_of_the_best():
     measured = Measured(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
     assert measured.best == "quasi-static"
-    group = console_tables.push_scores_tables(measured)
+    group = parts_tables.push_scores_tables(measured)
     models, distances, objects, _ = group.renderables
     numbers = ["-", "6.00", "0.500", "0.250"]
     assert rows_of(models) == [
@@ -294,15 +297,15 @@ def test_the_batch_simulator_repeats_its_pushes_too(weights, tmp_path):
 @pytest.mark.slow
 def test_the_commands_measure_print_and_write(weights, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = ["bench", "push", "--pushes", "6", "--worlds", "2", "--weights", str(weights), "--data", "data"]
-    cli.parse([*arguments, "--out", "push.json", "--models", "no motion", "learned"])()
+    arguments = ["push", "--pushes", "6", "--worlds", "2", "--weights", str(weights), "--data", "data"]
+    lab.parse([*arguments, "--out", "push.json", "--models", "no motion", "learned"])()
     printed = capsys.readouterr().out
     assert "learned, by distance" in printed
     value = json.loads((tmp_path / "push.json").read_text())
     assert list(value["models"]) == ["no motion", "learned"]
     assert value["settings"]["pushes"] >= 6
     # The same pushes, read instead of made.
-    cli.parse([*arguments, "--out", "again.json"])()
+    lab.parse([*arguments, "--out", "again.json"])()
     again = json.loads((tmp_path / "again.json").read_text())
     assert list(again["models"]) == list(push.ROWS)
     assert again["models"]["learned"] == value["models"]["learned"]

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure, recognition_methods
-from mechsearch_jax.benchmarks.parts.recognition import Bench, Row
-from mechsearch_jax.benchmarks.parts.recognition_methods import Method
-from mechsearch_jax.benchmarks.report import console_tables
-from mechsearch_jax.commands.bench import quality
+from mechsearch_jax.benchmarks.lab.commands import quality
+from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure, recognition_methods
+from mechsearch_jax.benchmarks.lab.parts.recognition import Bench, Row
+from mechsearch_jax.benchmarks.lab.parts.recognition_methods import Method
+from mechsearch_jax.benchmarks.lab.tables import parts_tables
+from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
@@ -134,7 +135,7 @@ def test_only_objects_with_enough_pixels_count(bench, measured):
 
 def test_a_file_holds_every_row_and_the_figures_that_follow_from_them(measured, tmp_path):
     path = tmp_path / "recognition.json"
-    images.save_rows(measured.value(), measured.rows, path)
+    save_rows(measured.value(), measured.rows, path)
     value = json.loads(path.read_text())
     rows = tuple(recognition.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
     assert rows == measured.rows
@@ -149,8 +150,8 @@ def test_tables_name_every_method_and_fit_a_terminal(measured):
     from rich.console import Console
 
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(console_tables.recognition_tables(measured))
-    console.print(console_tables.recognition_times_table(measured))
+    console.print(parts_tables.recognition_tables(measured))
+    console.print(parts_tables.recognition_times_table(measured))
     text = console.export_text()
     assert "…" not in text
     for name in METHODS:

@@ -11,12 +11,13 @@ from matplotlib import image
 from rich.console import Console
 
 from mechsearch_jax.benchmarks.report import report
-from mechsearch_jax.benchmarks.report.episode_tables import events_table, rates_table
+from mechsearch_jax.benchmarks.report.episode_tables import events_summary_table, summary_table
 from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
 from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
+from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, write_rows
 from mechsearch_jax.runtime.errors import InputError
 
@@ -86,7 +87,7 @@ def test_the_actions_of_errors_do_not_count(tmp_path):
     assert re.search(r"\| search-for-grasp \| 8 \| 1 \| 1 \|.*\| - \| 0\.00 \|", text)
     assert json.loads((tmp_path / "rates.json").read_text())["rates"][3]["steps"] is None
     screen = Console(file=io.StringIO(), width=100)
-    screen.print(rates_table(ROWS))
+    screen.print(summary_table(summarise(ROWS), Key.of(ROWS)))
     assert [line.split()[-3] for line in screen.file.getvalue().splitlines()[-2:]] == ["-", "6.5"]
 
 
@@ -101,7 +102,8 @@ def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
         lines = [(line["paper_episodes"], line["paper_graspable"]) for line in csv.DictReader(file)]
     assert lines == [("0", "")] * 2 + [("2", "0.5")] * 2
     screen = Console(file=io.StringIO(), width=100)
-    screen.print(rates_table([*said, OTHER]))
+    rows = [*said, OTHER]
+    screen.print(summary_table(summarise(rows), Key.of(rows)))
     assert [line.split()[4:7] for line in screen.file.getvalue().splitlines()[-1:]] == [["0.50", "1.00", "0.50"]]
 
 
@@ -138,7 +140,7 @@ def test_a_report_says_what_happened_on_the_way(tmp_path):
     ]
     assert json.loads((tmp_path / "rates.json").read_text())["events"][1]["truth_lost"] == 0.5
     assert report.failures(rows) == [report.Failures("search-for-grasp", fell, 2, 2 / 3)]
-    assert events_table(rows).row_count == 2
+    assert events_summary_table(summarise_events(rows), Key.of(rows)).row_count == 2
     unknown = [dataclasses.replace(row, truth_ruled_out=None) for row in rows]
     assert [events.texts()[2] for events in summarise_events(unknown)] == ["", ""]
 
@@ -148,7 +150,7 @@ def test_rows_of_earlier_versions_have_no_events(tmp_path):
     assert "These episodes do not say" in page_of(tmp_path)
     assert (tmp_path / "events.csv").read_text().startswith("method,objects,episodes,truth_lost,")
     assert json.loads((tmp_path / "rates.json").read_text())["events"] == []
-    assert events_table(ROWS) is None
+    assert not summarise_events(ROWS)
 
 
 def test_configurations_do_not_mix():

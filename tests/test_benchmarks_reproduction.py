@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from stored_rows import row_of
 
-from mechsearch_jax.benchmarks.paper.findings import (
+from mechsearch_jax.benchmarks.lab.site import reproduction_page
+from mechsearch_jax.benchmarks.lab.site.findings import (
     FAILS,
     FINDINGS,
     HOLDS,
@@ -16,11 +17,10 @@ from mechsearch_jax.benchmarks.paper.findings import (
     _verdict,
     verdicts,
 )
+from mechsearch_jax.benchmarks.lab.site.store_run import run_of
+from mechsearch_jax.benchmarks.lab.site.stored_tables import results_of_runs, setting_of
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PICK_AND_PLACE, PUSH, TABLES
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT, Setting
-from mechsearch_jax.benchmarks.paper.stored_tables import results_of_runs, setting_of
-from mechsearch_jax.benchmarks.report import reproduction_page
-from mechsearch_jax.benchmarks.report.store_run import run_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.rows import configuration, options_of
 from mechsearch_jax.benchmarks.store.runs import write_run

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mechsearch_jax.benchmarks.parts import images, segmentation
-from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps, true_masks
-from mechsearch_jax.benchmarks.report import console_tables
+from mechsearch_jax.benchmarks.lab.parts import images, segmentation
+from mechsearch_jax.benchmarks.lab.parts.segmentation import Bench, overlaps, true_masks
+from mechsearch_jax.benchmarks.lab.tables import parts_tables
+from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.drawing import save_figure
@@ -63,7 +64,7 @@ def test_overlaps_are_those_of_a_plain_count():
 
 
 def test_results_are_written_with_their_rows(perfect, tmp_path):
-    images.save_rows(perfect.value(), perfect.rows, tmp_path / "s.json")
+    save_rows(perfect.value(), perfect.rows, tmp_path / "s.json")
     value = json.loads((tmp_path / "s.json").read_text())
     assert value["summary"] == perfect.summary()
     rows = [segmentation.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
@@ -72,7 +73,7 @@ def test_results_are_written_with_their_rows(perfect, tmp_path):
 
 def test_the_table_shows_every_group(wrong):
     console = Console(file=io.StringIO(), width=120)
-    console.print(console_tables.segmentation_tables(wrong.run()))
+    console.print(parts_tables.segmentation_tables(wrong.run()))
     text = console.file.getvalue()
     assert "files scenes, clean" in text
     assert "files scenes, gaussian" in text

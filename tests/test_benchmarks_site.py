@@ -11,8 +11,8 @@ from PIL import Image
 from recordings import RECORDING
 from stored_rows import USUAL, row_of
 
-from mechsearch_jax.benchmarks.site import all_pages, gallery, method_pictures, set_pages
-from mechsearch_jax.benchmarks.site.set_texts import ABOUT, sets_of
+from mechsearch_jax.benchmarks.lab.site import all_pages, gallery, method_pictures, set_pages
+from mechsearch_jax.benchmarks.lab.site.set_texts import ABOUT, sets_of
 from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.options import find_scenario
@@ -53,7 +53,7 @@ SHELF = {"workcell.shelf.back": 0.864, "workcell.shelf.left": 0.55, "workcell.sh
     "workcell.shelf.spawn_y": [-0.25, 0.45],
 }
 PAGES_OF_SETS = f"run `python -m {set_pages.__name__}`"
-NAMES = "benchmarks/site/set_texts.py"
+NAMES = "benchmarks/lab/site/set_texts.py"
 
 
 def rates_on(name, *lines):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from mechsearch_jax.benchmarks.report.targets_table import targets_table
-from mechsearch_jax.benchmarks.targets.antipodal import Approaches, Lines, crossings, gripper_poses, lines
-from mechsearch_jax.benchmarks.targets.everyday import surface_of, write_things
-from mechsearch_jax.benchmarks.targets.graspable import Bench, GivenMesh, Row, by_mesh, load, summary
+from mechsearch_jax.benchmarks.lab.tables.targets_table import targets_table
+from mechsearch_jax.benchmarks.lab.targets.antipodal import Approaches, Lines, crossings, gripper_poses, lines
+from mechsearch_jax.benchmarks.lab.targets.everyday import surface_of, write_things
+from mechsearch_jax.benchmarks.lab.targets.graspable import Bench, GivenMesh, Row, by_mesh, load, summary
 from mechsearch_jax.envs.scenes.household import thing_of
 from mechsearch_jax.runtime.errors import InputError
 

@@ -7,10 +7,12 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mechsearch_jax.benchmarks.lab import __main__ as lab
 from mechsearch_jax.benchmarks.report.report_files import FILES
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
@@ -115,7 +117,7 @@ WRONG = {
     "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
     "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
-    "the same name twice in looks": (["bench", "looks", "good.json", "good.json"], "named 'one-box'"),
+    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "named 'one-box'"),
     "results in a file": (
         ["evaluate", "good.json", "--out", "out/rows.parquet"],
         "rows.parquet: results are kept in a folder, not in a file",
@@ -179,15 +181,15 @@ WRONG = {
         "c2-4: is a set of 180 scenes; name one of them, as c2-4-000",
     ),
     "no scene of a set": (["inspect", "c2-4-180", "--out", "out"], "c2-4-180: there is no such file"),
-    "no scenes to look at": (["bench", "scenes", "none.json"], "none.json: there is no such file"),
-    "the same source twice": (["bench", "scenes", "empty", "out/../empty"], "two sources are called empty"),
+    "no scenes to look at": (["lab", "scenes", "none.json"], "none.json: there is no such file"),
+    "the same source twice": (["lab", "scenes", "empty", "out/../empty"], "two sources are called empty"),
     "no results": (
-        ["bench", "ceiling", "good.json", "--results", "none.json", "--out", "new"],
+        ["lab", "ceiling", "good.json", "--results", "none.json", "--out", "new"],
         "none.json: cannot be read",
     ),
-    "no search": (["bench", "ceiling", "good.json", "--rounds", "0", "--out", "new"], "--rounds 0 must be at least 1"),
+    "no search": (["lab", "ceiling", "good.json", "--rounds", "0", "--out", "new"], "--rounds 0 must be at least 1"),
     "one scene twice": (
-        ["bench", "ceiling", "good.json", "good.json", "--out", "new"],
+        ["lab", "ceiling", "good.json", "good.json", "--out", "new"],
         "two scenes are called one-box",
     ),
     "no such suite": (["bench", "guard", "--scenes", "41", "--out", "new"], "--scenes"),
@@ -196,35 +198,35 @@ WRONG = {
         "none.json: cannot be read",
     ),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
-    "no meshes": (["bench", "targets"], "bench targets: there are no meshes"),
-    "no such mesh": (["bench", "targets", "none.obj"], "none.obj: there is no such file"),
-    "negative things": (["bench", "targets", "--things", "-1"], "bench targets: --things -1 must not be negative"),
-    "no antipodal grasps": (["bench", "targets", "--grasps", "0"], "bench targets: --grasps 0 must be at least 1"),
+    "no meshes": (["lab", "targets"], "lab targets: there are no meshes"),
+    "no such mesh": (["lab", "targets", "none.obj"], "none.obj: there is no such file"),
+    "negative things": (["lab", "targets", "--things", "-1"], "lab targets: --things -1 must not be negative"),
+    "no antipodal grasps": (["lab", "targets", "--grasps", "0"], "lab targets: --grasps 0 must be at least 1"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
     "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),
-    "negative scenes": (["bench", "recognition", "--scenes", "-1"], "--scenes -1 must be at least 0"),
-    "nothing to recognise": (["bench", "recognition", "--scenes", "0"], "there are no scenes"),
-    "unknown noise": (["bench", "recognition", "--noise", "fog"], "'fog'"),
-    "unknown seed": (["bench", "recognition", "--seed", "-1"], "--seed -1 must be from 0"),
+    "negative scenes": (["lab", "recognition", "--scenes", "-1"], "--scenes -1 must be at least 0"),
+    "nothing to recognise": (["lab", "recognition", "--scenes", "0"], "there are no scenes"),
+    "unknown noise": (["lab", "recognition", "--noise", "fog"], "'fog'"),
+    "unknown seed": (["lab", "recognition", "--seed", "-1"], "--seed -1 must be from 0"),
     "no images": (["bench", "perceive", "--batch", "0"], "--batch 0 must be at least 1"),
-    "nothing to segment": (["bench", "segmentation", "--scenes", "0"], "there are no scenes"),
-    "no picture of segments": (["bench", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
-    "no picture": (["bench", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
-    "the same scene twice": (["bench", "recognition", "good.json", "good.json"], '"one-box"'),
+    "nothing to segment": (["lab", "segmentation", "--scenes", "0"], "there are no scenes"),
+    "no picture of segments": (["lab", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
+    "no picture": (["lab", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
+    "the same scene twice": (["lab", "recognition", "good.json", "good.json"], '"one-box"'),
     "picture of nothing": (
-        ["bench", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
+        ["lab", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
         "--worst-of network-refined is not among the methods",
     ),
-    "file in a file": (["bench", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
-    "no pushes": (["bench", "push", "--pushes", "0"], "bench push: --pushes 0 must be at least 1"),
-    "unknown seed of pushes": (["bench", "push", "--seed", "-1"], "bench push: --seed -1 must be from 0"),
-    "unknown model": (["bench", "push", "--models", "guess"], "guess"),
+    "file in a file": (["lab", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
+    "no pushes": (["lab", "push", "--pushes", "0"], "lab push: --pushes 0 must be at least 1"),
+    "unknown seed of pushes": (["lab", "push", "--seed", "-1"], "lab push: --seed -1 must be from 0"),
+    "unknown model": (["lab", "push", "--models", "guess"], "guess"),
     "weights of nothing": (
-        ["bench", "push", "--models", "quasi-static", "--weights", "push.npz"],
+        ["lab", "push", "--models", "quasi-static", "--weights", "push.npz"],
         '--weights is for the model "learned"',
     ),
-    "no weights": (["bench", "push", "--weights", "none.npz"], "none.json: cannot be read"),
-    "pushes in a file": (["bench", "push", "--models", "no motion", "--data", "good.json"], "cannot be written to"),
+    "no weights": (["lab", "push", "--weights", "none.npz"], "none.json: cannot be read"),
+    "pushes in a file": (["lab", "push", "--models", "no motion", "--data", "good.json"], "cannot be written to"),
     "nothing to predict": (["bench", "predict", "--batch", "0"], "bench predict: --batch 0 must be at least 1"),
     "too many objects to push": (["bench", "predict", "--objects", "9"], "--objects 9 is not between 1 and 8"),
     "weights of no network": (
@@ -238,7 +240,7 @@ WRONG = {
     "nothing to scale": (["bench", "scaling"], "give --workers, --shards or --ray"),
     "no workers to scale": (["bench", "scaling", "--workers", "1", "0"], "--workers 0 must be at least 1"),
     "no rows to report": (["bench", "report", "--rows", "0"], "--rows 0 must be at least 1"),
-    "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
+    "nothing to agree on": (["lab", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "nothing to learn from": (["train", "recognition", "--out", "new", "--batch", "0"], "--batch 0 must be at least 1"),
     "no pushes to learn from": (["train", "push", "--out", "new", "--rounds", "0"], "train push: --rounds 0"),
     "a file to train into": (["train", "segmentation", "--out", "good.json"], "good.json: cannot be written to"),
@@ -251,15 +253,35 @@ WRONG = {
 def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, capsys, arguments, message):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     monkeypatch.chdir(folder)
+    program, arguments = (lab, arguments[1:]) if arguments[:1] == ["lab"] else (cli, arguments)
     monkeypatch.setattr(sys, "argv", ["mechsearch", *arguments])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        program.main()
     complaint = capsys.readouterr().err
     assert end.value.code == 2
     assert message in complaint
     assert complaint.endswith("\n")
     assert complaint.count("\n") == 1
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_what_a_checkout_alone_has_is_refused_with_the_way_there():
+    refused = [name for names in cli.IN_A_CHECKOUT.values() for name in names]
+    assert sorted(refused) == sorted(lab.COMMANDS)
+    for program, names in cli.IN_A_CHECKOUT.items():
+        for name in names:
+            with pytest.raises(InputError, match=f"run `python -m mechsearch_jax.benchmarks.lab {name}` in one"):
+                cli.parse([*program.split()[1:], name, "--help"])
+
+
+def test_the_lab_is_a_program_of_a_checkout(folder):
+    answer = subprocess.run(
+        [sys.executable, "-m", "mechsearch_jax.benchmarks.lab", "looks", "none.json"],
+        cwd=Path(__file__).parents[1], capture_output=True, text=True,
+    )  # fmt: skip
+    assert answer.returncode == 2
+    assert answer.stderr.startswith("mechsearch: none.json: there is no such file")
+    assert answer.stderr.count("\n") == 1
 
 
 def test_the_program_says_it_too_outside_the_checkout(folder):
@@ -385,10 +407,10 @@ def test_help_names_options_with_their_defaults(capsys):
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
 
 
-@pytest.mark.parametrize("command", ["search", "evaluate", "scenarios generate", "train push", "bench ceiling"])
+@pytest.mark.parametrize("command", ["search", "evaluate", "scenarios generate", "train push", "lab ceiling"])
 def test_help_tells_a_default_once(command, capsys):
     with pytest.raises(SystemExit):
-        cli.parse([*command.split(), "--help"])
+        (lab.parse if command.startswith("lab ") else cli.parse)([*command.removeprefix("lab ").split(), "--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "(default: None)" not in shown
     assert "(default: )" not in shown

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from mechsearch_jax.benchmarks.lab import PROGRAM
+from mechsearch_jax.benchmarks.lab import __main__ as lab
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.workspace.scenario import COMPOUND_VERSION, FORMAT, parse_scenario
@@ -77,27 +79,28 @@ def test_commands_are_understood(page):
             assert callable(cli.parse(arguments)), arguments
         elif program == "python" and arguments[0] == "-m":
             assert importlib.util.find_spec(arguments[1]), arguments
+            assert arguments[1] != PROGRAM.split()[-1] or callable(lab.parse(arguments[2:])), arguments
         else:
             assert program in OTHERS or (program == "python" and arguments[0] in OTHERS), (program, arguments)
 
 
-DRY = [words[1:] for page in PAGES for words in commands(page) if "--dry-run" in words]
+DRY = [words for page in PAGES for words in commands(page) if "--dry-run" in words]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", DRY, ids=" ".join)
 def test_what_would_be_run_is_said(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    cli.parse(arguments)()
+    (cli.parse(arguments[1:]) if arguments[0] == "mechsearch" else lab.parse(arguments[3:]))()
     assert re.search(r"\d+ episodes", capsys.readouterr().out)
     assert not list(tmp_path.rglob("*.parquet"))
 
 
 def test_what_is_no_command_is_noticed(tmp_path):
     page = tmp_path / "page.md"
-    loop = "for k in 0 1; do A=$k B=$(($(nproc) / 8)) mechsearch study gamma --out rows/$k & done  # all"
+    loop = "for k in 0 1; do A=$k B=$(($(nproc) / 8)) mechsearch evaluate c2 --out rows/$k & done  # all"
     page.write_text(f"```sh\n{loop}\n```\n")
-    assert list(commands(page)) == [["mechsearch", "study", "gamma", "--out", "rows/0"]]
+    assert list(commands(page)) == [["mechsearch", "evaluate", "c2", "--out", "rows/0"]]
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 import mechsearch_jax
+from mechsearch_jax.benchmarks.lab.site import results_page
+from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
-from mechsearch_jax.benchmarks.report import results_page
-from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45
 from mechsearch_jax.benchmarks.store.rows import options_of
@@ -338,7 +338,7 @@ def test_what_came_of_fifty_searches_in_a_cell_is_what_is_stored():
     assert all(row["retrieved"] or row["idle"] for row in rows)
     retrieved = sum(row["retrieved"] for row in rows)
     assert f"took [{retrieved} of {len(rows)} hidden targets out](" in " ".join(read("README.md").split())
-    assert stored["config"] == read("benchmarks/parts/cells/other-cell.toml")
+    assert stored["config"] == read("benchmarks/lab/parts/cells/other-cell.toml")
 
 
 def test_stored_scenes_are_those_on_record():

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.parts.push import repeated
+from mechsearch_jax.benchmarks.lab.parts.push import repeated
 from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs.pushing import pushes as generator
 from mechsearch_jax.envs.pushing.push_portions import portions

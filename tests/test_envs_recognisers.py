@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.parts.segmentation import numbered
+from mechsearch_jax.benchmarks.lab.parts.segmentation import numbered
 from mechsearch_jax.envs.camera import recognisers
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
 from mechsearch_jax.envs.camera.recognisers import detected, large_segments, recogniser, true_labels

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from mechsearch_jax.benchmarks.site import notebooks
+from mechsearch_jax.benchmarks.lab.site import notebooks
 from mechsearch_jax.runtime.errors import InputError
 
 ROOT = Path(__file__).parents[1]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax.benchmarks.looks.bodies import Bench, Truth
+from mechsearch_jax.benchmarks.lab.looks.bodies import Bench, Truth
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.scenes.household import body_at, standing_height, thing_of

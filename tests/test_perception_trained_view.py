@@ -26,9 +26,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import camera_faults
 
 HERE = Path(__file__).resolve().parents[1]
-PLACES = {
-    file.stem: load_settings(file).workcell for file in sorted((HERE / "benchmarks" / "parts" / "views").glob("*.toml"))
-}
+VIEWS = HERE / "benchmarks" / "lab" / "parts" / "views"
+PLACES = {file.stem: load_settings(file).workcell for file in sorted(VIEWS.glob("*.toml"))}
 NEAR = ["camera-right", "camera-ahead", "camera-back", "shelf-low", "shelf-wide", "shelf-narrow"]
 FAR = {"far-camera": "distance", "far-level": "elevation", "far-shelf": "depth"}
 NETWORKS = ("recognition", "segmentation")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mechsearch_jax.benchmarks.site.first_picture import OUT
+from mechsearch_jax.benchmarks.lab.site.first_picture import OUT
 from mechsearch_jax.workspace.scenario import example_scenarios
 
 ROOT = Path(__file__).parents[1]

@@ -1,12 +1,18 @@
-"""Imports point one way: from benchmarks and training to the simulated shelf, from that to the planner, never round."""
+"""Imports point one way: from the lab and benchmarks to the simulated shelf, from that to the planner, never round."""
 
 import ast
+import runpy
+import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("benchmarks", "train", "envs")
+# By their folders; a package in another one is none of its rooms.
+PACKAGES = {"lab": "benchmarks/lab", "benchmarks": "benchmarks", "train": "train", "envs": "envs"}
 # What a package may import, beside itself.
 BELOW = {
+    "lab": {"benchmarks", "train", "envs", "mechsearch_jax"},
     "benchmarks": {"train", "envs", "mechsearch_jax"},
     "train": {"envs", "mechsearch_jax"},
     "envs": {"mechsearch_jax"},
@@ -18,6 +24,8 @@ def place(name):
     first, *rest = name.split(".")
     if first != "mechsearch_jax":
         return None
+    if rest[:2] == ["benchmarks", "lab"]:
+        rest = rest[1:]
     package, room = [*rest, "", ""][:2]
     return (package, room) if package in PACKAGES else (first, package)
 
@@ -26,7 +34,8 @@ def imports(file):
     """The places that a file imports from, also inside of functions."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            submodules = node.module in ("mechsearch_jax", *(f"mechsearch_jax.{name}" for name in PACKAGES))
+            packages = (f"mechsearch_jax.{folder.replace('/', '.')}" for folder in PACKAGES.values())
+            submodules = node.module in ("mechsearch_jax", *packages)
             yield from (place(f"{node.module}.{name.name}" if submodules else node.module) for name in node.names)
         elif isinstance(node, ast.Import):
             yield from (place(name.name) for name in node.names)
@@ -36,8 +45,11 @@ def arrows(*packages):
     """From each room of these packages: which places it imports from."""
     imported = {}
     for package in packages:
-        for file in (ROOT / package).rglob("*.py"):
-            inside = file.relative_to(ROOT / package).parts
+        folder = ROOT / PACKAGES.get(package, package)
+        for file in folder.rglob("*.py"):
+            inside = file.relative_to(folder).parts
+            if package == "benchmarks" and inside[0] == "lab":
+                continue
             room = package, inside[0] if len(inside) > 1 else inside[0].removesuffix(".py")
             imported.setdefault(room, set()).update(other for other in imports(file) if other and other != room)
     return imported
@@ -79,6 +91,7 @@ def test_packages_import_what_is_below_them_alone():
 def test_no_room_needs_one_that_needs_it():
     imported = arrows(*PACKAGES)
     assert ("envs", "simulators") in imported["envs", "trials"]
+    assert ("lab", "studies") in imported["lab", "commands"]
     assert circles(imported) == set()
 
 
@@ -93,6 +106,20 @@ def test_nor_does_one_of_the_planner():
 def test_the_planner_knows_no_benchmarks_and_in_one_place_the_simulators():
     for file in (ROOT / "mechsearch_jax").rglob("*.py"):
         inside = file.relative_to(ROOT / "mechsearch_jax").parts
-        if inside[0] != "commands":
-            above = {"envs"} if inside == ("session", "simulated.py") else set()
-            assert {other[0] for other in imports(file) if other} <= {"mechsearch_jax"} | above, file
+        above = {"envs"} if inside == ("session", "simulated.py") else set()
+        if inside[0] == "commands":
+            above = {"envs", "train", "benchmarks"}
+        assert {other[0] for other in imports(file) if other} <= {"mechsearch_jax"} | above, file
+
+
+def test_the_lab_is_no_part_of_the_wheel(monkeypatch):
+    setuptools = pytest.importorskip("setuptools")
+    found = {}
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(setuptools, "setup", found.update)
+    runpy.run_path("setup.py")
+    packages = {package for package in found["packages"] if package.startswith("mechsearch_jax.benchmarks")}
+    assert {"mechsearch_jax.benchmarks", "mechsearch_jax.benchmarks.report"} < packages
+    assert not [package for package in packages if place(package)[0] == "lab"]
+    data = tomllib.loads(Path("pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    assert set(data) <= set(found["packages"])

@@ -280,7 +280,7 @@ def test_files_are_not_overwritten_silently(tmp_path, save):
 @pytest.mark.slow
 def test_a_simulated_arm_follows_random_actions():
     """Pushes and retrievals all over the shelf; the benchmark `trajectories` does so for those that a planner draws."""
-    from mechsearch_jax.benchmarks.parts.trajectories import Follower
+    from mechsearch_jax.benchmarks.lab.parts.trajectories import Follower
 
     follower, rng = Follower(SETTING, 0.004), np.random.default_rng(0)
     config = dataclasses.replace(CONFIG, free=FreeMotionConfig(attempts=200))

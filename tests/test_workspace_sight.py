@@ -25,7 +25,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import BODY, OPENGL, blindness, camera_faults, check_camera
 from mechsearch_jax.workspace.target import Target
 
-VIEWS = sorted((Path(__file__).parents[1] / "benchmarks" / "parts" / "views").glob("*.toml"))
+VIEWS = sorted((Path(__file__).parents[1] / "benchmarks" / "lab" / "parts" / "views").glob("*.toml"))
 INVERTED = (
     "camera: T_world_camera looks inverted: its inverse sees the shelf; give the camera's pose in the robot's frame"
 )

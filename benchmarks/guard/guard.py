@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.stats
 
-from mechsearch_jax.benchmarks.parts.images import save_rows
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
+from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
 from mechsearch_jax.runtime.errors import InputError

@@ -19,18 +19,20 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action
-from mechsearch_jax.benchmarks.parts.push import named_model, weights_of
+from mechsearch_jax.dynamics.learned import NAME, LearnedPush
 from mechsearch_jax.dynamics.named import PushModelName
-from mechsearch_jax.dynamics.push_model import PushOutcome
+from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.pushing.pushes import PushesConfig, draw_push, push_tables
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator, draws_from
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, graspability, pairs
+from mechsearch_jax.networks.weights import load_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
 from mechsearch_jax.planner import trials as trying
@@ -40,6 +42,7 @@ from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.push import push_scenes
+from mechsearch_jax.train.push_scores import no_motion
 from mechsearch_jax.train.scenes import random_world
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
@@ -329,6 +332,31 @@ def drawn_pushes(count: int, objects: int, seed: int = 0, tries: int = 100) -> t
         if total >= count:
             return jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:count]), *parts)
     raise InputError(f"bench predict: only {total} of {count} pushes were possible with {objects} objects; take fewer")
+
+
+def named_model(name: str, weights: Path | None = None) -> PushModel:
+    """The push model of a name, as a plan uses it for first actions, or `no_motion`.
+
+    Args:
+      name: "no motion", "quasi-static", "learned" or "physics".
+      weights: of the learned model; the shipped ones if None.
+
+    Raises:
+      InputError: there is no model of that name, its weights are missing or damaged, or Warp cannot be imported.
+    """
+    if name == "no motion":
+        return no_motion
+    if name == "learned" and weights is not None:
+        return LearnedPush(weights)
+    return push_models(name).first
+
+
+def weights_of(model: PushModel) -> dict[str, Any] | None:
+    """SHA-256 and number of parameters of a learned model's weights; None for other models."""
+    if not isinstance(model, LearnedPush) or model.path is None:
+        return None
+    parameters = load_weights(model.path, NAME).parameters
+    return {"sha256": model.digest, "parameters": sum(a.size for a in jax.tree.leaves(parameters))}
 
 
 def bench_predict(

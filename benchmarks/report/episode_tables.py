@@ -1,4 +1,4 @@
-"""Results of whole episodes on the screen: rates by variant, what share of scenes can be solved, what a suite lost."""
+"""Results of whole episodes on the screen: rates by variant, and what a suite lost."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks.ceiling import solvability
 from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
 from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
-from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
+from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
@@ -35,11 +34,6 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
             console.print(f"{short}  {label}", soft_wrap=True)
     elif key.common:
         console.print(f"all {key.common}", style="dim", soft_wrap=True)
-
-
-def rates_table(rows: Sequence[EpisodeRow]) -> Table:
-    """Rates of success by variant and number of objects; see `summary_table`."""
-    return summary_table(summarise(rows), Key.of(rows))
 
 
 def summary_table(summary: Sequence[Rates], key: Key) -> Table:
@@ -120,12 +114,6 @@ def differences_table(differences: VariantDifferences, key: Key, baseline: str) 
     return table
 
 
-def events_table(rows: Sequence[EpisodeRow]) -> Table | None:
-    """What happened on the way, by variant and number of objects; None where no row says it."""
-    summary = summarise_events(rows)
-    return events_summary_table(summary, Key.of(rows)) if summary else None
-
-
 def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
     """What happened on the way, of at least one group."""
     table = plain_table()
@@ -141,26 +129,6 @@ def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
             style="bold" if events.objects is None else None,
         )
     return table
-
-
-def ceiling_table(rows: Sequence[solvability.Row]) -> Group:
-    """What share of scenes can be solved: a row for each number of objects; and below it why the others were not."""
-    table = plain_table("scenes that can be solved at all")
-    for name in ("objects", "scenes", "in an episode", "by the search", "solvable", "95% interval"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for line in solvability.summary(rows):
-        low, high = line["solvable_interval"]
-        table.add_row(
-            "all" if line["objects"] is None else str(line["objects"]),
-            str(line["scenes"]),
-            str(line["solved_in_an_episode"]),
-            str(line["solved_by_the_search"]),
-            f"{line['solvable']:.2f}",
-            f"{low:.2f} to {high:.2f}",
-            style="bold" if line["objects"] is None else None,
-        )
-    reasons = [Text(f"{row.scenario}: {row.reason}") for row in rows if not row.solvable]
-    return Group(table, *reasons)
 
 
 def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:

@@ -1,7 +1,7 @@
 """Stored runs: all rows of a run as one small Parquet file, and beside it what comes of them as JSON lines.
 
 `NAME.parquet` holds the fields of `EpisodeRow` alone, in few bytes: what can be computed from them is left out, and
-times are rounded. `NAME.jsonl` has a line for each variant, scene set and number of objects; `report.store_run` makes
+times are rounded. `NAME.jsonl` has a line for each variant, scene set and number of objects; `lab.site.store_run` makes
 it.
 """
 
@@ -41,7 +41,7 @@ class StoredRun:
     Attributes:
       name: of its files.
       rows: all of them.
-      lines: what comes of them, by variant, scene set and number of objects; see `report.store_run`.
+      lines: what comes of them, by variant, scene set and number of objects; see `lab.site.store_run`.
     """
 
     name: str

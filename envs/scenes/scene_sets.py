@@ -80,7 +80,7 @@ def _blocks(
     return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed, **more) for count in counts)
 
 
-# By name; those of benchmarks/parts/views.
+# By name; those of benchmarks/lab/parts/views.
 SHELVES: Mapping[str, Shelf] = {
     "usual": Shelf(),
     "low": Shelf(front=0.374, back=0.748, board=0.3045, ceiling=0.673, spawn_x=(0.41, 0.69)),

@@ -32,7 +32,6 @@ from mechsearch_jax.commands.recordings import video, view
 from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
-from mechsearch_jax.commands.study import study
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, Note, nearest
@@ -60,7 +59,6 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "sweep": sweep,
     "reproduce": reproduce,
-    "study": study,
     "report": report,
     "config": print_config,
     "doctor": doctor,
@@ -68,12 +66,31 @@ COMMANDS: Commands = {
         "List scene sets, generate, check and import scenarios: mechsearch scenarios list|generate|check|import."
     ),
     "train": _only_described("Train the networks: mechsearch train segmentation|recognition|push."),
-    "bench": _only_described("Measure the parts, one command each."),
+    "bench": _only_described("Time the parts and whole episodes, one command each."),
 }
 GROUPS: Mapping[str, Commands] = {
     "scenarios": scenarios.COMMANDS,
     "train": train.COMMANDS,
     "bench": bench.COMMANDS,
+}
+# What only a checkout has: benchmarks/lab.
+IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
+    "mechsearch": ("study",),
+    "mechsearch bench": (
+        "agreement",
+        "bodies",
+        "calibration",
+        "ceiling",
+        "cell",
+        "detection",
+        "looks",
+        "push",
+        "reach",
+        "recognition",
+        "scenes",
+        "segmentation",
+        "targets",
+    ),
 }
 
 
@@ -143,6 +160,21 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     commands = GROUPS[group] if group else COMMANDS
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
     rest = list(arguments[1:] if group else arguments)
+    if rest and rest[0] in IN_A_CHECKOUT.get(program, ()):
+        raise InputError(
+            f"{program} {rest[0]} needs a checkout: run `python -m mechsearch_jax.benchmarks.lab {rest[0]}` in one"
+        )
+    return call_of(program, description, commands, rest)
+
+
+def call_of(program: str, description: str | None, commands: Commands, arguments: Sequence[str]) -> Callable[[], None]:
+    """The one of a program's commands that is named first, with its arguments, ready to be called.
+
+    Raises:
+      InputError: the arguments are wrong.
+      SystemExit: after help was printed.
+    """
+    rest = list(arguments)
     name = rest[0] if rest else None
     if name is not None and name not in commands and not name.startswith("-"):
         raise InputError(
@@ -178,8 +210,8 @@ def _noted(usual: Callable[..., None]) -> Callable[..., None]:
     return show
 
 
-def main() -> None:
-    """The console command `mechsearch`."""
+def run(parse: Callable[[Sequence[str]], Callable[[], None]]) -> None:
+    """Run what the command line says, as `parse` reads it; bad input ends with one line and status 2."""
     # Tracing makes millions of small objects that are not garbage: looking for it takes a fifth of a start.
     gc.set_threshold(200_000, 20, 20)
     # They are meant for other programs; so worker processes do without them, too.
@@ -198,6 +230,11 @@ def main() -> None:
         # The reader, such as `head`, has closed the pipe. Discard the rest that Python writes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
+
+
+def main() -> None:
+    """The console command `mechsearch`."""
+    run(parse)
 
 
 if __name__ == "__main__":

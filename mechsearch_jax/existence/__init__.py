@@ -11,8 +11,8 @@ the target is hidden there, the place may keep showing as many coarse pixels, si
 coarse image alone.
 
 A pose whose cell contains any hidden place must stay possible, or the target is lost. In generated scenes f is 1.13
-times as large as that least set (40 scenes, 25 places a cell at full resolution, `mechsearch bench scenes --exact`),
-which is itself 1.63 times as large as with the cells' middles alone.
+times as large as that least set (40 scenes, 25 places a cell at full resolution, `python -m
+mechsearch_jax.benchmarks.lab scenes --exact`), which is itself 1.63 times as large as with the cells' middles alone.
 """
 
 from mechsearch_jax.existence.closer_look import allowances, closer_image, plainly_elsewhere

@@ -74,7 +74,7 @@ class Tolerance:
         return (trained * self.low, trained * self.high) if self.times else (trained + self.low, trained + self.high)
 
 
-# From measurements with `benchmarks/parts/views` (docs/method.md, "Other cameras and shelves").
+# From measurements with `benchmarks/lab/parts/views` (docs/method.md, "Other cameras and shelves").
 TOLERANCES: Mapping[str, Tolerance] = {
     "distance": Tolerance("camera: its distance from the middle of the board is", "{:.2f} m", 0.8, 1.4),
     "azimuth": Tolerance(

@@ -55,8 +55,8 @@ class RefinementConfig:
     """How recognised shapes are refined; lengths in metres, angles in radians.
 
     The defaults are for the recognition network, which is mostly right to half a millimetre: with much looser priors,
-    less noise or a wider loss, stray points at the edges of a time-of-flight image make its results worse (`mechsearch
-    bench recognition` measures it). For worse initial shapes there is `rough`.
+    less noise or a wider loss, stray points at the edges of a time-of-flight image make its results worse (`python -m
+    mechsearch_jax.benchmarks.lab recognition` measures it). For worse initial shapes there is `rough`.
 
     Attributes:
       hypotheses: shapes that are tried for every object, as (e1, e2, turn about the object's z from the recognised

@@ -1,12 +1,5 @@
-"""`mechsearch bench`: how long the parts take, how good they are, and what whole episodes come to."""
+"""`mechsearch bench`: how long the parts take, and whether whole episodes come to less than before."""
 
-from mechsearch_jax.commands.bench import cells, episodes, looks, quality, targets, timing
+from mechsearch_jax.commands.bench import episodes, timing
 
-COMMANDS = {
-    **timing.COMMANDS,
-    **quality.COMMANDS,
-    **looks.COMMANDS,
-    **cells.COMMANDS,
-    **targets.COMMANDS,
-    **episodes.COMMANDS,
-}
+COMMANDS = {**timing.COMMANDS, **episodes.COMMANDS}

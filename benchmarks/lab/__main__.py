@@ -1,0 +1,38 @@
+"""What is measured and compared for this package itself: `python -m mechsearch_jax.benchmarks.lab NAME ...`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mechsearch_jax.benchmarks.lab import PROGRAM
+from mechsearch_jax.benchmarks.lab.commands import cells, episodes, looks, quality, targets
+from mechsearch_jax.benchmarks.lab.commands.study import study
+from mechsearch_jax.commands.main import Commands, call_of, run
+
+COMMANDS: Commands = {
+    "study": study,
+    **quality.COMMANDS,
+    **looks.COMMANDS,
+    **cells.COMMANDS,
+    **targets.COMMANDS,
+    **episodes.COMMANDS,
+}
+
+
+def parse(arguments: Sequence[str]) -> Callable[[], None]:
+    """The command with its arguments, ready to be called.
+
+    Raises:
+      InputError: the arguments are wrong.
+      SystemExit: after help was printed.
+    """
+    return call_of(PROGRAM, "Measure the parts, and compare variants, one command each.", COMMANDS, arguments)
+
+
+def main() -> None:
+    """The program."""
+    run(parse)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""What comes of images, end to end."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from mechsearch_jax.commands.options import (
+    JsonFile,
+    Scenarios,
+    check_files,
+    find_scenarios,
+    forget_kept_compilations,
+)
+from mechsearch_jax.runtime.errors import InputError
+
+Noise = Literal["clean", "gaussian", "time-of-flight"]
+Segments = Literal["network", "explained", "joined", "true"]
+Description = Literal["one", "parts", "true parts"]
+
+
+def bench_looks(
+    scenarios: Scenarios,
+    /,
+    *,
+    noise: tuple[Noise, ...] = ("gaussian",),
+    segments: tuple[Segments, ...] = ("explained",),
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Measure what comes of a depth and a colour image alone: which visible objects are missing, off or turned,
+    phantoms, missed targets, and how often objects are wrong by their stated confidence.
+
+    MuJoCo renders the images, not the package's own camera. The target is red, the objects have random colours.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      noise: of the depth image, one or more; "gaussian" is 1 mm.
+      segments: those that explain the image, the same without dividing one, the segmentation network's alone, or the
+        true masks; several are looked at in turn.
+      seed: of the noise and of the recogniser.
+      out: JSON file for the figures, and for every object that is not right.
+
+    Raises:
+      InputError: two scenarios have the same name, or the file cannot be written.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.lab.looks import looks
+    from mechsearch_jax.benchmarks.lab.looks.pictures import taken
+    from mechsearch_jax.benchmarks.lab.tables.looks_tables import looks_tables
+    from mechsearch_jax.problem.workcell import Workcell
+    from mechsearch_jax.runtime.files import save_json
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    check_files(out)
+    files = find_scenarios(scenarios)
+    console = Console(highlight=False)
+    with console.status("rendering") as status:
+        pictures = {}
+        for number, file in enumerate(files):
+            scenario = load_scenario(file)
+            if scenario.name in pictures:
+                raise InputError(f"lab looks: {file}: another scenario is named {scenario.name!r}, too; rename it")
+            pictures[scenario.name] = scenario, taken(Workcell(), scenario)
+            status.update(f"rendering {number + 1}/{len(files)}")
+        bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
+        forget_kept_compilations()
+        status.update("compiling")
+        measured = bench.run(lambda done: status.update(f"looking {done}/{bench.looks}"))
+        if out is not None:
+            save_json(measured.value(), out)
+    console.print(looks_tables(measured))
+
+
+def bench_bodies(
+    scenarios: Scenarios,
+    /,
+    *,
+    described_by: tuple[Description, ...] = ("one", "parts", "true parts"),
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Measure how well recognised bodies describe the true ones: the volume in common, and whether the gripper at
+    random poses near an object is rightly said to hit it. The images are those of `--recognition masks`.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      described_by: each object by one superquadric, by up to four, or by those that its true shape is known by.
+      seed: of noise, recognition and poses.
+      out: JSON file for the figures, with every object.
+
+    Raises:
+      InputError: two scenarios have the same name, or the file cannot be written.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.lab.looks import bodies
+    from mechsearch_jax.benchmarks.lab.tables.bodies_tables import bodies_tables
+    from mechsearch_jax.runtime.files import save_json
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    check_files(out)
+    scenes = {}
+    for file in find_scenarios(scenarios):
+        scenario = load_scenario(file)
+        if scenario.name in scenes:
+            raise InputError(f"lab bodies: {file}: another scenario is named {scenario.name!r}, too; rename it")
+        scenes[scenario.name] = scenario
+    console = Console(highlight=False)
+    with console.status("compiling") as status:
+        bench = bodies.Bench(scenes, tuple(dict.fromkeys(described_by)), seed)
+        forget_kept_compilations()
+        measured = bench.run(lambda done: status.update(f"looking {done}/{len(scenes)}"))
+        if out is not None:
+            save_json(measured.value(), out)
+    console.print(bodies_tables(measured))
+
+
+COMMANDS = {"looks": bench_looks, "bodies": bench_bodies}

@@ -1,0 +1,280 @@
+"""Writes docs/results.md, what holds today: `python -m mechsearch_jax.benchmarks.lab.site.results_page` in a checkout.
+
+The page is the template `results_page.md` beside this file. A field of the template is a value of a stored result,
+`{simulate-h200[steps_per_second]}` of `benchmarks/results/simulate-h200.json`, or one that is computed here. What was
+measured on the way to today's default is in docs/experiments.md, which is written by hand.
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
+from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
+from mechsearch_jax.benchmarks.statistics.intervals import share_interval
+from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
+from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
+from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
+from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
+from mechsearch_jax.runtime.files import PathLike
+
+Episode = Mapping[str, Any]
+COUNTS = (2, 4, 6, 8)
+TEMPLATE = Path(__file__).with_name("results_page.md")
+# Of today's default, and of the former ones. Fields of the page are named after them.
+RUNS = ("report-i-h200", "table1-narrow-sides-h200", "report-h-whole-h200", "collision-free-h200")
+# The default before, in the run of today's first one.
+BEFORE = "report-i-before-h200"
+# Of the default before, on scenes that it was chosen on.
+PUBLISHED = "published-narrow-sides-h200"
+# Whose decisions are timed in a batch.
+BATCH = "one-ahead-c2-h200"
+RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
+
+
+class Stored(dict[str, Any]):
+    """The stored results of a folder by the names of their files without `.json`, read when they are asked for.
+
+    A timing also has `ms`: the median, the fastest and the slowest of its calls [ms].
+    """
+
+    def __init__(self, folder: PathLike) -> None:
+        super().__init__()
+        self.folder = Path(folder)
+
+    def __missing__(self, name: str) -> Any:
+        self[name] = json.loads((self.folder / f"{name}.json").read_bytes(), object_hook=_with_milliseconds)
+        return self[name]
+
+    def run(self, name: str, run: str) -> dict[str, Any]:
+        """One run of a file, by its name or policy, whose episodes are by the names of their columns."""
+        (chosen,) = (each for each in self[name]["runs"] if each.get("name", each.get("policy")) == run)
+        return chosen | {"episodes": [dict(zip(self[name]["columns"], row, strict=True)) for row in chosen["episodes"]]}
+
+
+def _with_milliseconds(value: dict[str, Any]) -> dict[str, Any]:
+    if "median_seconds" not in value or "seconds" not in value:
+        return value
+    seconds = {"median": value["median_seconds"], "fastest": min(value["seconds"]), "slowest": max(value["seconds"])}
+    return value | {"ms": {name: 1000 * each for name, each in seconds.items()}}
+
+
+def table(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    rows = ["| " + " | ".join(map(str, cells)) + " |" for cells in (header, *lines)]
+    return "\n".join([rows[0], "|" + "---|" * len(header), *rows[1:]])
+
+
+def with_objects(episodes: Iterable[Episode], count: int) -> list[Episode]:
+    """The episodes whose scenes, `SET-OBJECTS-NUMBER`, have a number of objects."""
+    return [episode for episode in episodes if episode["scenario"].split("-")[-2] == str(count)]
+
+
+def reached(episodes: Sequence[Episode], key: str) -> list[bool]:
+    """For each episode whether it got there; `key` is a step, None where never, or a flag."""
+    return [episode[key] is not None and episode[key] is not False for episode in episodes]
+
+
+def share(reached: Sequence[bool], digits: int = 2) -> str:
+    """The share of what is true."""
+    return f"{sum(reached) / len(reached):.{digits}f}"
+
+
+def with_interval(episodes: Sequence[Episode], key: str) -> str:
+    """A share of episodes with its 95% interval."""
+    flags = reached(episodes, key)
+    low, high = share_interval(flags, [episode["scenario"] for episode in episodes])
+    return f"{share(flags)} ({low:.2f} to {high:.2f})"
+
+
+def rate_cells(episodes: Sequence[Episode]) -> list[str]:
+    """The cells under `RATES` without the number of objects."""
+    has_graspable = all("graspable_step" in episode for episode in episodes)
+    return [
+        str(len(episodes)),
+        with_interval(episodes, "found_step"),
+        with_interval(episodes, "graspable_step") if has_graspable else "–",
+        share(reached(episodes, "paper_graspable_step")),
+        with_interval(episodes, "retrieved"),
+        f"{sum(episode['steps'] for episode in episodes) / len(episodes):.1f}",
+    ]
+
+
+def rates(column: str, groups: Mapping[str, Sequence[Episode]]) -> str:
+    """A table of rates by number of objects of groups of episodes, which `column` is the header of."""
+    lines = [
+        [label, count, *rate_cells(with_objects(episodes, count))]
+        for label, episodes in groups.items()
+        for count in COUNTS
+    ]
+    return table([column, *RATES], lines)
+
+
+def mishaps(groups: Mapping[str, Sequence[Episode]]) -> str:
+    """A table of what went wrong on the way in groups of episodes, and why episodes were lost."""
+    lines = []
+    for label, episodes in groups.items():
+        lost = collections.Counter(each["failure"].split(" at action")[0] for each in episodes if each["failure"])
+        reasons = "; ".join(f"{reason} {count}" for reason, count in lost.most_common())
+        shares = [share([each[key] > 0 for each in episodes], 3) for key in ("objects_fallen", "held_up", "truth_lost")]
+        lines.append([label, len(episodes), *shares, reasons])
+    header = ["scenes", "episodes", "an object left the board", "the arm was held up", "f ruled out the true pose"]
+    return table([*header, "lost: episodes by reason"], lines)
+
+
+def paper_rates(episodes: Sequence[Episode]) -> str:
+    """The table of preset `paper` beside the paper's figures."""
+    lines = []
+    for count in COUNTS:
+        chosen = with_objects(episodes, count)
+        figures = paper_figures(TABLES["table1"], "oracle", METHODS[1], BOTH, count)
+        assert figures is not None
+        ours = [share(reached(chosen, key)) for key in ("found_step", "graspable_step", "retrieved")]
+        lines.append([count, len(chosen), *ours, f"{figures.find:.2f}", f"{figures.grasp:.2f}"])
+    header = ["objects", "episodes", "found", "graspable", "retrieved", "the paper: found", "the paper: graspable"]
+    return table(header, lines)
+
+
+def pushes(stored: Stored) -> str:
+    """The table of push models."""
+    places = [("push-h200", name) for name in ("no motion", "quasi-static", "learned")]
+    places += [("push-cpu", name) for name in ("learned", "physics", "nudged")]
+    lines = []
+    for file, name in places:
+        line = stored[file]["models"][name]["all"]
+        errors = f"{line['pushed_mm']:.1f} mm, {line['pushed_deg']:.1f}°", f"{line['other_mm']:.1f} mm"
+        lines.append([name, f"{line['pushes']:,}", *errors, f"{line['still']:.3f}", f"{line['topple_ap']:.2f}"])
+    header = ["model", "pushes", "pushed object", "others that moved", "stays, and is predicted to"]
+    return table([*header, "falls over, average precision"], lines)
+
+
+def perception(stored: Stored) -> str:
+    """The table of recognition and segmentation, by scenes and noise."""
+    lines = []
+    for source, scenes in (("held-out", "held-out"), ("files", "published")):
+        for noise, label in (("clean", "none"), ("gaussian", "1 mm"), ("time-of-flight", "time-of-flight")):
+            shapes, segments = (
+                [each for each in stored[file]["summary"] if (each["source"], each["noise"]) == (source, noise)]
+                for file in ("recognition-cpu", "segmentation-cpu")
+            )
+            volumes = {each["method"]: each["iou_mean"] for each in shapes if each["visible"] == "all"}
+            pixels = {each["objects"]: each["iou_mean"] for each in segments}
+            cells = [volumes[name] for name in ("network", "network-refined", "ems-refined")]
+            lines.append([scenes, label, *(f"{cell:.3f}" for cell in (*cells, pixels[None], pixels[8]))])
+    header = ["scenes", "noise", "network", "network, refined", "EMS, refined"]
+    return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
+
+
+def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[EpisodeRow]:
+    """The rows with such settings on scenes that nothing was chosen on; a later option was as it is usually."""
+    wanted = Settings(preset, differing)
+    rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
+    return [row for row in rows if settings_of(options_of(row)) == wanted]
+
+
+def _named(label: str, rows: Sequence[EpisodeRow]) -> dict[str, list[Episode]]:
+    """Rows as episodes, by a label that says with how many seeds where there are several."""
+    seeds = len({row.seed for row in rows})
+    return {f"{label}, {seeds} seeds" if seeds > 1 else label: [vars(row) for row in rows]}
+
+
+def _change(after: Sequence[EpisodeRow], before: Sequence[EpisodeRow]) -> dict[str, Any]:
+    """How many points more are retrieved than in the same episodes of other rows, in words: `pairs`, `all` with its 95%
+    interval, and `each` by number of objects."""
+    pairs = same_episodes(after, before)
+    change = change_of(pairs, OUTCOMES["retrieved"])
+    assert change.mean is not None
+    assert change.interval is not None
+    low, high = (100 * bound for bound in change.interval)
+    means = [change_of(same_episodes(after, before, count), OUTCOMES["retrieved"]).mean or 0.0 for count in COUNTS]
+    return {
+        "pairs": change.pairs,
+        "all": f"{100 * change.mean:+.1f} ({low:+.1f} to {high:+.1f})",
+        "each": ", ".join(f"{100 * mean:+.1f}" for mean in means),
+    }
+
+
+def default_rates(
+    today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun, *, beside: StoredRun
+) -> dict[str, Any]:
+    """The fields of the template about what the default and the one before reach, with true shapes and from images;
+    `beside` is of the one before, in the run of today's."""
+    masks, full = {"recognition": "masks"}, {"recognition": "full"}
+    new, new_full = _on_new_scenes(today), _on_new_scenes(today, **full)
+    old, old_full = _on_new_scenes(before, WITHIN_45), _on_new_scenes(before, WITHIN_45, **full)
+    front_grasps = _on_new_scenes(collision_free, FROM_THE_FRONT, **masks, retrieval_contact=False)
+    default = {**_named("`report-i`", new), **_named("before: `report-h`", old)}
+    seen = _named("`full`, `report-i`", new_full)
+    free = _named("until 2026-11-28: `masks`, `c2`, collision-free grasps only", front_grasps)
+    return {
+        "default_rates": rates("scenes", default),
+        "default_mishaps": mishaps({**default, **seen}),
+        "image_rates": rates(
+            "recognition",
+            {
+                **_named("before: `masks`, `c2`", _on_new_scenes(table1, WITHIN_45, **masks)),
+                **free,
+                **_named("before: `full`, `c2`", _on_new_scenes(table1, WITHIN_45, **full)),
+                **seen,
+            },
+        ),
+        "farther_sides": _change(new, beside.rows)["all"],
+        "loss": _change(new_full, new),
+        "loss_before": _change(old_full, old),
+    }
+
+
+def computed(stored: Stored) -> dict[str, Any]:
+    """The fields of the template that are no values of a file."""
+    new = stored.run("standard-h100", "c2")
+    paper = stored.run("published-paper-h200", "search-for-grasp")
+    runs = [load_run(stored.folder / "runs", name) for name in RUNS]
+    clock = new["clock"]["nothing kept"]
+    published = [vars(row) for row in load_run(stored.folder / "runs", PUBLISHED).rows]
+    batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-farther-sides-batch-h200"]
+    frictions = {"same": "X1", "half": "X5", "double": "X2"}
+    starts = stored["scenes-start-cpu"]["summary"]
+    return {
+        **{"new": new, "paper": paper, "batch": batch.lines[0]},
+        **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
+        **default_rates(*runs, beside=load_run(stored.folder / "runs", BEFORE)),
+        "published": with_interval(published, "retrieved"),
+        "paper_rates": paper_rates(paper["episodes"]),
+        "pushes": pushes(stored),
+        "perception": perception(stored),
+        "batch_decision": 1000 * sum(row.planning_seconds for row in batch.rows) / sum(row.steps for row in batch.rows),
+        "at_once": planned["shapes"]["batch"] / planned["median_seconds"],
+        "batch_ready": clock["all compiled [s]"],
+        "batch_seconds": clock["last episode [s]"] - clock["all compiled [s]"],
+        **{
+            f"friction_{name}": share(reached(stored.run("rehearsal-frictions-cpu", run)["episodes"], "retrieved"))
+            for name, run in frictions.items()
+        },
+        "starts": sum(each["scenes"] for each in starts),
+        "starts_ruled_out": sum(each["truth_ruled_out"] for each in starts),
+        "in_sight": sum(
+            each["target_found"] for each in stored["scenes-cpu"]["summary"] if each["source"] == "published"
+        ),
+    }
+
+
+def page(folder: PathLike) -> str:
+    """The page in Markdown, from the folder of stored results."""
+    stored = Stored(folder)
+    stored.update(computed(stored))
+    return TEMPLATE.read_text(encoding="utf-8").format_map(stored)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Rewrite the page."""
+    rewrite(page, "results", "benchmarks/results", "docs/results.md", arguments)
+
+
+if __name__ == "__main__":
+    main()
