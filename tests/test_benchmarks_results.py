@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.statistics.variants import label_variants
 from mechsearch_jax.benchmarks.store.rows import (
     EVENTS,
     SCHEMA,
-    Row,
+    EpisodeRow,
     configuration,
     episode_key,
     identity,
@@ -43,7 +43,7 @@ STEPS = (
     Step(17, True, True, 33.0, None, None, None, 0, "the object slipped", {"plan": 0.25}),
 )
 EPISODE = Episode("two-things", 2, OPTIONS, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
-ROW = Row(
+ROW = EpisodeRow(
     scenario="two-things",
     objects=2,
     target="cylinder",
@@ -94,16 +94,16 @@ def test_what_happened_on_the_way_is_read_back_and_counted(tmp_path):
     save_episode(dataclasses.replace(EPISODE, steps=steps), tmp_path / "episode.json")
     episode = load_episode(tmp_path / "episode.json")
     assert episode.steps == steps
-    row = Row.of_episode(episode)
+    row = EpisodeRow.of_episode(episode)
     assert [getattr(row, name) for name in EVENTS] == [3, 2, 1, 1, 2, 2, 1, 1, 1, 2, 0]
-    unknown = Row.of_episode(dataclasses.replace(episode, steps=()))
+    unknown = EpisodeRow.of_episode(dataclasses.replace(episode, steps=()))
     assert [getattr(unknown, name) for name in EVENTS] == [None] * len(EVENTS)
 
 
 def test_a_row_says_whether_the_papers_grasps_would_have_done():
     for flags, step, expected in (((False, True), 1, True), ((False, False), None, False)):
         steps = tuple(dataclasses.replace(STEPS[0], paper_graspable=flag) for flag in flags)
-        row = Row.of_episode(dataclasses.replace(EPISODE, steps=steps, paper_graspable_step=step))
+        row = EpisodeRow.of_episode(dataclasses.replace(EPISODE, steps=steps, paper_graspable_step=step))
         assert (row.paper_graspable, row.paper_graspable_step) == (expected, step)
 
 
@@ -247,7 +247,7 @@ def test_confidence_intervals_are_those_of_the_formula():
 def test_every_option_is_a_column(tmp_path):
     method = Method(config=PRESETS["standard"](gamma=0.5, push_distances=(0.1,), max_steps=7))
     options = {**method.options(), "target": "box", "simulator": "NativeSimulator", "seed": 3}
-    row = Row.of_episode(dataclasses.replace(EPISODE, config=options))
+    row = EpisodeRow.of_episode(dataclasses.replace(EPISODE, config=options))
     write_rows([row, ROW], tmp_path / "rows.parquet")
     first, second = pyarrow.parquet.read_table(tmp_path / "rows.parquet").to_pylist()
     for name, value in options.items():
@@ -262,7 +262,7 @@ def test_a_row_says_what_ran_it_and_how_long_compiling_took():
     timings = ({"plan": 0.5, "simulate": 1.0, "compile": 20.0}, {"plan": 0.25, "compile": 2.0})
     steps = tuple(dataclasses.replace(step, timings=spent) for step, spent in zip(STEPS, timings, strict=True))
     versions = {"jax": "1.2.3", "device": "cpu: cpu"}
-    row = Row.of_episode(dataclasses.replace(EPISODE, steps=steps, versions=versions), "this code")
+    row = EpisodeRow.of_episode(dataclasses.replace(EPISODE, steps=steps, versions=versions), "this code")
     assert (row.planning_seconds, row.simulation_seconds, row.compile_seconds) == (0.75, 1.0, 22.0)
     assert (row.code, row.device, json.loads(row.versions)) == ("this code", "cpu: cpu", {"jax": "1.2.3"})
 
