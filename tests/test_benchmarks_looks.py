@@ -134,13 +134,13 @@ def test_missed_and_false_targets_are_counted():
 
 def test_a_bench_of_nothing_is_refused():
     with pytest.raises(InputError, match="nothing to look at"):
-        looks.Bench({})
+        looks.LooksBench({})
 
 
 @pytest.mark.slow
 def test_a_simple_scene_is_all_right_and_its_target_is_seen(scene):
     scenario, picture = scene
-    bench = looks.Bench({scenario.name: scene}, ("gaussian",), ("explained", "true"))
+    bench = looks.LooksBench({scenario.name: scene}, ("gaussian",), ("explained", "true"))
     measured = bench.run()
     lines = [line for line in measured.summary() if "looks" in line]
     assert [line["segments"] for line in lines] == ["explained", "true"]

@@ -14,7 +14,7 @@ from rich.console import Console
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.lab import __main__ as lab
 from mechsearch_jax.benchmarks.lab.parts import push
-from mechsearch_jax.benchmarks.lab.parts.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.lab.parts.push import MeasuredPushes, PushBench, held_out_generation, nudged, repeated
 from mechsearch_jax.benchmarks.lab.tables import parts_tables
 from mechsearch_jax.benchmarks.parts import bench
 from mechsearch_jax.benchmarks.report import console_tables
@@ -48,7 +48,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def comparison(weights):
-    return Bench(GENERATION, weights=weights, make_simulator=simulator)
+    return PushBench(GENERATION, weights=weights, make_simulator=simulator)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,9 @@ def pushes(comparison, folder):
 @pytest.fixture(scope="module")
 def measured(weights, pushes):
     """Of few models."""
-    return Bench(GENERATION, ("no motion", "learned", "nudged"), weights=weights, make_simulator=simulator).run(pushes)
+    return PushBench(GENERATION, ("no motion", "learned", "nudged"), weights=weights, make_simulator=simulator).run(
+        pushes
+    )
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +97,7 @@ def test_impossible_pushes_are_refused(wrong):
 @pytest.mark.parametrize("wrong", [{"rows": ()}, {"rows": ("guess",)}, {"rows": ("nudged",), "weights": "push.npz"}])
 def test_impossible_comparisons_are_refused(wrong):
     with pytest.raises(InputError, match="lab push"):
-        Bench(GENERATION, **wrong)
+        PushBench(GENERATION, **wrong)
 
 
 @pytest.mark.slow
@@ -181,7 +183,7 @@ def test_simulating_is_better_than_guessing(comparison, pushes):
 def test_named_rows_are_measured_in_their_order(pushes):
     seen = []
     rows = ("quasi-static", "no motion", "quasi-static")
-    few = Bench(GENERATION, rows, make_simulator=simulator).run(pushes, lambda *progress: seen.append(progress))
+    few = PushBench(GENERATION, rows, make_simulator=simulator).run(pushes, lambda *progress: seen.append(progress))
     assert list(few.scores) == ["quasi-static", "no motion"]
     assert seen == [("quasi-static", len(pushes.object)), ("no motion", len(pushes.object))]
     assert few.weights is None
@@ -240,7 +242,7 @@ def rows_of(table):
 
 
 def test_the_tables_show_every_model_and_the_groups_of_the_best():
-    measured = Measured(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
+    measured = MeasuredPushes(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
     assert measured.best == "quasi-static"
     group = parts_tables.push_scores_tables(measured)
     models, distances, objects, _ = group.renderables
@@ -260,7 +262,7 @@ def test_the_tables_show_every_model_and_the_groups_of_the_best():
 
 
 def test_the_learned_model_is_looked_at_closely_if_there_is_one():
-    measured = Measured(
+    measured = MeasuredPushes(
         {"learned": {"all": LINE | {"pushed_mm": 99.0}}, **SCORES}, {}, {"pushes": 4}, {"device": "cpu"}
     )
     assert measured.best == "learned"
@@ -287,7 +289,7 @@ def test_predicting_is_timed(model, drawn, weights, monkeypatch):
 
 @pytest.mark.slow
 def test_the_batch_simulator_repeats_its_pushes_too(weights, tmp_path):
-    comparison = Bench(GENERATION, ("no motion", "nudged"), make_simulator=lambda: generator.engine(True))
+    comparison = PushBench(GENERATION, ("no motion", "nudged"), make_simulator=lambda: generator.engine(True))
     measured = comparison.run(comparison.pushes(tmp_path))
     assert measured.settings["simulator"] == "MjxSimulator"
     every = {name: groups["all"] for name, groups in measured.scores.items()}

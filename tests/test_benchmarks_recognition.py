@@ -13,7 +13,7 @@ import pytest
 
 from mechsearch_jax.benchmarks.lab.commands import quality
 from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure, recognition_methods
-from mechsearch_jax.benchmarks.lab.parts.recognition import Bench, Row
+from mechsearch_jax.benchmarks.lab.parts.recognition import RecognitionBench, RecognitionRow
 from mechsearch_jax.benchmarks.lab.parts.recognition_methods import Method
 from mechsearch_jax.benchmarks.lab.tables import parts_tables
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
@@ -27,7 +27,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
 TRUTH = sharpened(true_superquadrics(SCENE.world))
-ROW = Row("files", "a", 0, "box", "clean", "network", 500, 0.5, "answered", 0.9, 0.001, True)
+ROW = RecognitionRow("files", "a", 0, "box", "clean", "network", 500, 0.5, "answered", 0.9, 0.001, True)
 
 
 def method_of(scene, after=None):
@@ -52,7 +52,7 @@ METHODS = {
 
 @pytest.fixture(scope="module")
 def bench():
-    return Bench([SCENE], METHODS)
+    return RecognitionBench([SCENE], METHODS)
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ def test_a_file_holds_every_row_and_the_figures_that_follow_from_them(measured, 
     path = tmp_path / "recognition.json"
     save_rows(measured.value(), measured.rows, path)
     value = json.loads(path.read_text())
-    rows = tuple(recognition.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
+    rows = tuple(recognition.RecognitionRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
     assert rows == measured.rows
     assert value["summary"] == dataclasses.replace(measured, rows=rows).summary()
     assert set(value["seconds_per_object"]) == set(METHODS)
@@ -205,13 +205,13 @@ def test_methods_bring_along_what_they_begin_with():
 )
 def test_a_comparison_of_nothing_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
-        Bench(**{"scenes": [SCENE], "methods": METHODS, **wrong})
+        RecognitionBench(**{"scenes": [SCENE], "methods": METHODS, **wrong})
 
 
 @pytest.mark.parametrize(("slow_scenes", "expected"), [(1, 1), (3, 3), (7, 7), (10, 10), (99, 10), (None, 10)])
 def test_slow_methods_are_measured_on_scenes_spread_over_all(slow_scenes, expected):
     methods = {"fast": method_of(TRUTH), "slow": Method(shifted, slow=True)}
-    bench = Bench([SCENE] * 10, methods, slow_scenes=slow_scenes)
+    bench = RecognitionBench([SCENE] * 10, methods, slow_scenes=slow_scenes)
     chosen = [i for i in range(10) if "slow" in bench.methods_for(i)]
     assert len(chosen) == expected
     assert chosen[0] == 0
@@ -265,7 +265,7 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
     assert [shelf.left for _, shelf in seen] == list(places.values())
     assert {camera.fx for camera, _ in seen} == {76.2}
     value = json.loads(out.read_text())
-    rows = [recognition.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
+    rows = [recognition.RecognitionRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
     assert list(dict.fromkeys(row.source for row in rows)) == list(places)
     assert {name: place["shelf"]["left"] for name, place in value["settings"]["places"].items()} == places
     assert value["settings"]["held_out_scenes"] == 1
@@ -302,7 +302,7 @@ def test_refinement_improves_on_the_network_whatever_the_noise():
     """On scenes of a seed that nothing was tuned on; what is hardly visible must not get worse either."""
     methods = recognition.shipped_methods(shelf_view().camera, Shelf())
     chosen = recognition.chosen_methods(methods, ["network-refined"])
-    measured = Bench(images.held_out_scenes(12, 7), chosen, tuple(images.NOISES)).run()
+    measured = RecognitionBench(images.held_out_scenes(12, 7), chosen, tuple(images.NOISES)).run()
     lines = {(line["noise"], line["visible"]): line for line in measured.summary() if "gain_mean" in line}
     for noise in images.NOISES:
         assert lines[noise, "all"]["objects"] > 40
@@ -315,11 +315,11 @@ def test_refinement_improves_on_the_network_whatever_the_noise():
 @pytest.mark.slow
 def test_the_classical_method_recognises_what_is_clearly_seen():
     methods = recognition.shipped_methods(shelf_view().camera, Shelf())
-    measured = Bench([SCENE], {"ems": methods["ems"]}, ("clean",)).run()
+    measured = RecognitionBench([SCENE], {"ems": methods["ems"]}, ("clean",)).run()
     visible = [row for row in measured.rows if row.visible > 0.6]
     assert {row.outcome for row in visible} == {"answered"}
     assert max(row.iou for row in visible) > 0.8
-    points, labels = recognition_methods.sampled_points(Bench([SCENE], METHODS).image(0, "clean")[1].shown)
+    points, labels = recognition_methods.sampled_points(RecognitionBench([SCENE], METHODS).image(0, "clean")[1].shown)
     counts = np.bincount(np.asarray(labels)[np.asarray(labels) >= 0], minlength=8)
     assert counts.max() == recognition.EMS_POINTS
     assert bool(jax.numpy.isfinite(points[labels >= 0]).all())

@@ -10,7 +10,7 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
 
 from mechsearch_jax.benchmarks.lab.parts import scenes
 from mechsearch_jax.benchmarks.lab.parts.exact_existence import exact_existence
-from mechsearch_jax.benchmarks.lab.parts.scenes import Row, look_at_all, nearest_pose, save_scenes, summary
+from mechsearch_jax.benchmarks.lab.parts.scenes import SceneRow, look_at_all, nearest_pose, save_scenes, summary
 from mechsearch_jax.benchmarks.lab.tables.parts_tables import scenes_table
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
@@ -22,7 +22,7 @@ from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-ROW = Row("a", "one", "0123456789ab", 2, "cylinder", 40, 792, True, 0, 0.0, 2, 0.75)
+ROW = SceneRow("a", "one", "0123456789ab", 2, "cylinder", 40, 792, True, 0, 0.0, 2, 0.75)
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_figures_are_those_of_the_rows(tmp_path):
     save_scenes(rows, tmp_path / "scenes.json")
     value = json.loads((tmp_path / "scenes.json").read_text())
     assert value["summary"] == summary(rows)
-    assert [Row(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
+    assert [SceneRow(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
     assert "jax" in value["versions"]
     assert value["code"] == present_code()
     with pytest.raises(InputError, match="there are no scenes"):

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax.benchmarks.lab.parts import images, segmentation
-from mechsearch_jax.benchmarks.lab.parts.segmentation import Bench, overlaps, true_masks
+from mechsearch_jax.benchmarks.lab.parts.segmentation import SegmentationBench, overlaps, true_masks
 from mechsearch_jax.benchmarks.lab.tables import parts_tables
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import TARGET
@@ -28,12 +28,12 @@ def two_as_one(key, shelf, points, of_target, masks):
 
 @pytest.fixture(scope="module")
 def perfect():
-    return Bench([SCENE], ("clean",), labeller=true_masks).run()
+    return SegmentationBench([SCENE], ("clean",), labeller=true_masks).run()
 
 
 @pytest.fixture(scope="module")
 def wrong():
-    return Bench([SCENE], ("clean", "gaussian"), labeller=two_as_one)
+    return SegmentationBench([SCENE], ("clean", "gaussian"), labeller=two_as_one)
 
 
 def test_the_true_masks_are_perfect(perfect):
@@ -67,7 +67,7 @@ def test_results_are_written_with_their_rows(perfect, tmp_path):
     save_rows(perfect.value(), perfect.rows, tmp_path / "s.json")
     value = json.loads((tmp_path / "s.json").read_text())
     assert value["summary"] == perfect.summary()
-    rows = [segmentation.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
+    rows = [segmentation.SegmentRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
     assert rows == list(perfect.rows)
 
 
@@ -101,4 +101,4 @@ def test_the_picture_shows_the_worst_images_first(wrong, tmp_path):
 )
 def test_a_measurement_of_nothing_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
-        Bench(**{"scenes": [SCENE], **wrong})
+        SegmentationBench(**{"scenes": [SCENE], **wrong})

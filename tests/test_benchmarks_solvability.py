@@ -14,7 +14,7 @@ from stage import HIDDEN, OPEN, TWO
 
 from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks.lab.ceiling import solvability, unsolved
-from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, Outcomes, Row, read_outcomes, summary
+from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, read_outcomes, summary
 from mechsearch_jax.benchmarks.lab.ceiling.unsolved import blockers, in_the_way, reason
 from mechsearch_jax.benchmarks.lab.tables.parts_tables import ceiling_table
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
@@ -139,7 +139,7 @@ def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, mon
 
 
 def test_shares_are_those_of_the_rows(tmp_path):
-    row = Row("a", "00", 2, 4, 1, True)
+    row = CeilingRow("a", "00", 2, 4, 1, True)
     rows = [
         row,
         dataclasses.replace(row, scenario="b", retrieved=0, actions=3, rounds=1, simulated=9, seconds=1.0),
@@ -153,7 +153,7 @@ def test_shares_are_those_of_the_rows(tmp_path):
     assert everything["solvable_interval"] == wilson(3, 4)
     solvability.save_ceiling(rows, {"rounds": 3}, "mechsearch bench ceiling", tmp_path / "ceiling.json")
     value = json.loads((tmp_path / "ceiling.json").read_text())
-    assert [Row(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
+    assert [CeilingRow(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
     assert (value["command"], value["settings"]) == ("mechsearch bench ceiling", {"rounds": 3})
     table, why = ceiling_table(rows).renderables
     assert table.row_count == 3
@@ -165,7 +165,7 @@ RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "ceiling-cpu.jso
 
 def test_the_stored_summary_of_the_ceiling_is_that_of_its_scenes():
     stored = json.loads(RESULT.read_text())
-    rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
+    rows = [CeilingRow(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
     lines = summary(rows)
     assert json.loads(json.dumps(lines)) == stored["summary"]
 
@@ -174,7 +174,7 @@ def test_the_stored_summary_of_the_ceiling_is_that_of_its_scenes():
 @pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not next to this checkout")
 def test_stored_actions_take_the_target_out():
     stored = json.loads(RESULT.read_text())
-    rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
+    rows = [CeilingRow(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
     scenes = {scene.content_hash: scene for scene in map(load_scenario, published_scenarios())}
     codes, world = {kind.name: code for code, kind in KINDS.items()}, NativeWorld()
     for row in (row for row in rows if row.path):

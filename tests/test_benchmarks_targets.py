@@ -10,11 +10,11 @@ import trimesh
 from mechsearch_jax.benchmarks.lab.tables.targets_table import targets_table
 from mechsearch_jax.benchmarks.lab.targets.antipodal import Approaches, Lines, crossings, gripper_poses, lines
 from mechsearch_jax.benchmarks.lab.targets.everyday import surface_of, write_things
-from mechsearch_jax.benchmarks.lab.targets.graspable import Bench, GivenMesh, Row, by_mesh, load, summary
+from mechsearch_jax.benchmarks.lab.targets.graspable import GivenMesh, TargetRow, TargetsBench, by_mesh, load, summary
 from mechsearch_jax.envs.scenes.household import thing_of
 from mechsearch_jax.runtime.errors import InputError
 
-ROW = Row("mug", 0.6, 0.1, 0.3, 200, 0, 0, False, 12, 9, True, [10.0, 30.0, 0.0, 80.0, 4.0])
+ROW = TargetRow("mug", 0.6, 0.1, 0.3, 200, 0, 0, False, 12, 9, True, [10.0, 30.0, 0.0, 80.0, 4.0])
 
 
 def test_rays_cross_a_sphere_where_they_should():
@@ -123,15 +123,15 @@ def test_the_share_is_of_poses_where_physics_succeeds():
 
 def test_what_cannot_be_compared_is_one_line(tmp_path):
     with pytest.raises(InputError, match="there are no meshes"):
-        Bench(())
+        TargetsBench(())
     with pytest.raises(InputError, match="two meshes are called mug"):
-        Bench([GivenMesh("mug", tmp_path), GivenMesh("mug", tmp_path / "b")])
+        TargetsBench([GivenMesh("mug", tmp_path), GivenMesh("mug", tmp_path / "b")])
 
 
 @pytest.mark.slow
 def test_both_sides_take_a_box_out(tmp_path):
     trimesh.creation.box((0.03, 0.04, 0.1)).export(str(tmp_path / "box.obj"))
-    bench = Bench([GivenMesh("box", tmp_path / "box.obj")], poses=1, grasps=60, seed=2)
+    bench = TargetsBench([GivenMesh("box", tmp_path / "box.obj")], poses=1, grasps=60, seed=2)
     seen = []
     (row,) = bench.run(seen.append)
     assert row.planner

@@ -13,7 +13,7 @@ from stored_rows import row_of
 from mechsearch_jax.benchmarks.running import estimate as estimates
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
-from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, Measured, StoredSeconds, entries
+from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, MeasuredSeconds, StoredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
 from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
@@ -230,7 +230,7 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
     estimated = estimate(planned, "rows", 2)
     assert (estimated.variants, estimated.episodes, estimated.there, estimated.compilations) == (2, 4, 3, 1)
     (part,) = estimated.parts
-    assert (part.kind, part.seconds) == (Kind.of(Method()), Measured(3.5, 75.0, 2))
+    assert (part.kind, part.seconds) == (Kind.of(Method()), MeasuredSeconds(3.5, 75.0, 2))
     assert part.grounds == "from 2 rows of the folder"
     assert estimated.hours == pytest.approx((1 * 3.5 / 2 + 75.0) / 3600)
     assert estimate(planned, "rows", 2, retry_errors=True).there == 2
@@ -242,9 +242,13 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
 
 def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
     batch, native = "MjxSimulator", "NativeSimulator"
-    clock = StoredSeconds("gpu: H100", Kind("standard", "oracle", True, batch), Measured(0.1, 90.0, 720), "one.json")
-    slow = dataclasses.replace(clock, kind=Kind("paper", "masks", False, batch), seconds=Measured(2.0, 60.0, 9))
-    published = dataclasses.replace(slow, kind=slow.kind._replace(simulator=native), seconds=Measured(3.0, 60.0, 9))
+    clock = StoredSeconds(
+        "gpu: H100", Kind("standard", "oracle", True, batch), MeasuredSeconds(0.1, 90.0, 720), "one.json"
+    )
+    slow = dataclasses.replace(clock, kind=Kind("paper", "masks", False, batch), seconds=MeasuredSeconds(2.0, 60.0, 9))
+    published = dataclasses.replace(
+        slow, kind=slow.kind._replace(simulator=native), seconds=MeasuredSeconds(3.0, 60.0, 9)
+    )
     monkeypatch.setattr(estimates, "stored_seconds", lambda: [clock, slow, published])
     methods = [
         Method(engine=batch),

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax.benchmarks.lab.looks.bodies import Bench, Truth
+from mechsearch_jax.benchmarks.lab.looks.bodies import BodiesBench, Truth
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.scenes.household import body_at, standing_height, thing_of
@@ -286,4 +286,4 @@ def test_the_true_box_has_all_volume_in_common_and_every_collision():
     assert score["right"] == 1.0
     assert Truth(body, 0).score(exact.replace(size=0.8 * exact.size))["iou"] < 0.6
     with pytest.raises(InputError, match="nothing to look at"):
-        Bench({})
+        BodiesBench({})

@@ -51,7 +51,7 @@ Progress = Callable[[str], None]
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class MeasuredScaling:
     """How fast so many workers were.
 
     Attributes:
@@ -100,21 +100,21 @@ def _measured(
     command: str,
     episodes: int,
     seconds: tuple[float, float, float | None],
-) -> Measured:
+) -> MeasuredScaling:
     """A measurement of rows, with what they say of themselves.
 
     Args:
-      case: as in `Measured`, and so are `workers`, `command` and `episodes`.
+      case: as in `MeasuredScaling`, and so are `workers`, `command` and `episodes`.
       share: cores of each worker.
       rows: of all episodes.
-      seconds: the three times of `Measured` [s].
+      seconds: the three times of `MeasuredScaling` [s].
 
     Raises:
       InputError: an episode could not be run to its end.
     """
     if failed := next((row for row in rows if row.is_error), None):
         raise InputError(f"bench scaling: {failed.scenario}: {failed.failure}")
-    return Measured(
+    return MeasuredScaling(
         case=case,
         workers=workers,
         cores=share,
@@ -191,7 +191,7 @@ def keep_what_is_compiled(scenarios: Sequence[Scenario], progress: Progress) -> 
 
 def measure_workers(
     scenarios: Sequence[Scenario], workers: int, share: int, command: str, progress: Progress = lambda what: None
-) -> Measured:
+) -> MeasuredScaling:
     """How fast worker processes run episodes one after the other, each a copy of these scenes.
 
     Args:
@@ -297,7 +297,7 @@ def measure_gpus(
     share: int,
     command: str,
     progress: Progress = lambda what: None,
-) -> Measured:
+) -> MeasuredScaling:
     """How fast GPUs run episodes in batches.
 
     Args:
@@ -327,18 +327,18 @@ def measure_gpus(
     return _measured(case, count, share, rows, command, len(times) - 1, (seconds, seconds, None))
 
 
-def read_measured(path: PathLike) -> list[Measured]:
+def read_measured(path: PathLike) -> list[MeasuredScaling]:
     """What a file of `add_measured` holds; nothing where it is not there.
 
     Raises:
       InputError: it cannot be read, or holds something else.
     """
-    names = {field.name for field in dataclasses.fields(Measured)}
+    names = {field.name for field in dataclasses.fields(MeasuredScaling)}
     measured = []
     try:
         for line in Path(path).read_text(encoding="utf-8").splitlines():
             value = json.loads(line)
-            measured.append(Measured(**{name: value[name] for name in names}))
+            measured.append(MeasuredScaling(**{name: value[name] for name in names}))
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -346,7 +346,7 @@ def read_measured(path: PathLike) -> list[Measured]:
     return measured
 
 
-def add_measured(measured: Measured, path: PathLike) -> None:
+def add_measured(measured: MeasuredScaling, path: PathLike) -> None:
     """Add a line of JSON to a file, which is made if it is not there.
 
     Raises:
@@ -357,17 +357,17 @@ def add_measured(measured: Measured, path: PathLike) -> None:
         file.write("".join(json.dumps(each.value()) + "\n" for each in lines).encode())
 
 
-def ratio(measured: Measured, all_measured: Sequence[Measured]) -> float:
+def ratio(measured: MeasuredScaling, all_measured: Sequence[MeasuredScaling]) -> float:
     """How many times the rate of the fewest workers of the same case, cores, code and device."""
     alike = [each for each in all_measured if _of(each) == _of(measured)]
     return measured.rate / min(alike, key=lambda each: each.workers).rate
 
 
-def _of(measured: Measured) -> tuple[Any, ...]:
+def _of(measured: MeasuredScaling) -> tuple[Any, ...]:
     return measured.case, measured.cores, measured.code, measured.device
 
 
-def scaling_table(measured: Sequence[Measured]) -> Table:
+def scaling_table(measured: Sequence[MeasuredScaling]) -> Table:
     """How fast so many workers were, and how many times the rate of the fewest: a row for each measurement."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for name in ("", "workers", "cores", "episodes", "seconds", "episodes/s", "CPU s each", "times"):

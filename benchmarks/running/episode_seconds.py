@@ -68,7 +68,7 @@ class Kind(NamedTuple):
         )
 
 
-class Measured(NamedTuple):
+class MeasuredSeconds(NamedTuple):
     """Mean wall times.
 
     Attributes:
@@ -95,7 +95,7 @@ class StoredSeconds:
 
     device: str
     kind: Kind
-    seconds: Measured
+    seconds: MeasuredSeconds
     source: str
 
 
@@ -112,10 +112,10 @@ def _kind_of(configuration: str) -> Kind:
     return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials, simulator)
 
 
-def measured(rows: Sequence[EpisodeRow], compilations: int, at_once: int = 1) -> Measured:
+def measured(rows: Sequence[EpisodeRow], compilations: int, at_once: int = 1) -> MeasuredSeconds:
     """Mean seconds of an episode, and of a compilation if as many processes waited for each at once."""
     running = sum(row.planning_seconds + row.simulation_seconds for row in rows) / len(rows)
-    return Measured(running, sum(row.compile_seconds or 0.0 for row in rows) / compilations / at_once, len(rows))
+    return MeasuredSeconds(running, sum(row.compile_seconds or 0.0 for row in rows) / compilations / at_once, len(rows))
 
 
 @functools.cache
@@ -125,7 +125,7 @@ def stored_seconds() -> Sequence[StoredSeconds]:
         StoredSeconds(
             entry["device"],
             Kind(*(entry[name] for name in Kind._fields)),
-            Measured(entry["episode_seconds"], entry["compile_seconds"], entry["episodes"]),
+            MeasuredSeconds(entry["episode_seconds"], entry["compile_seconds"], entry["episodes"]),
             entry["source"],
         )
         for entry in json.loads(FILE.read_text(encoding="utf-8"))
@@ -176,7 +176,7 @@ def earlier(folder: PathLike) -> StoredSeconds:
     return StoredSeconds(
         H100,
         Kind(THREE_AHEAD, "oracle", True, "MjxSimulator"),
-        Measured(episode, compiling, len(run["episodes"])),
+        MeasuredSeconds(episode, compiling, len(run["episodes"])),
         f"benchmarks/results/{EARLIER}",
     )
 

@@ -12,7 +12,7 @@ import jax
 
 from mechsearch_jax.benchmarks.running.episode_seconds import (
     Kind,
-    Measured,
+    MeasuredSeconds,
     kind_of,
     measured,
     nearest,
@@ -29,7 +29,7 @@ from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
 
 # Of an episode and of a compilation where nothing was measured on such a device: on one CPU core [s].
-ASSUMED = Measured(8.0, 60.0, 0)
+ASSUMED = MeasuredSeconds(8.0, 60.0, 0)
 # The options that are data in what is compiled.
 CONTINUOUS = frozenset(path[0].name for path, _ in jax.tree_util.tree_flatten_with_path(PlannerConfig())[0])
 
@@ -49,7 +49,7 @@ class Part(NamedTuple):
     kind: Kind
     left: int
     compilations: int
-    seconds: Measured
+    seconds: MeasuredSeconds
     grounds: str
 
 
@@ -157,7 +157,7 @@ class _Clocks:
             self._folder.setdefault(kind_of(row.configuration), []).append(row)
         self._stored = stored_seconds()
 
-    def of(self, kind: Kind) -> tuple[Measured, str]:
+    def of(self, kind: Kind) -> tuple[MeasuredSeconds, str]:
         """What an episode of a kind and its compilation take, and how that is known."""
         if self._folder:
             of_rows = min(self._folder, key=kind.distance)

@@ -37,7 +37,7 @@ USES = {"calibrate": ALL_PIXELS, "look": FEW_PIXELS}
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class OffsetRow:
     """One fit.
 
     Attributes:
@@ -69,10 +69,10 @@ class Row:
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
-    """Results of a run; see `Row`."""
+class MeasuredOffsets:
+    """Results of a run; see `OffsetRow`."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[OffsetRow, ...]
     settings: dict[str, Any]
     versions: dict[str, str]
 
@@ -88,7 +88,7 @@ class Measured:
         return {"settings": self.settings, "versions": self.versions, "summary": self.summary()}
 
 
-def _summary(rows: Sequence[Row]) -> dict[str, Any]:
+def _summary(rows: Sequence[OffsetRow]) -> dict[str, Any]:
     moved, unmoved = ([row for row in rows if (row.shift > 0) is is_moved] for is_moved in (True, False))
     errors = {}
     for i, name in enumerate(NUMBERS):
@@ -116,7 +116,7 @@ def _summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bench:
+class CalibrationBench:
     """A measurement on scenes.
 
     Attributes:
@@ -146,7 +146,7 @@ class Bench:
             "time-of-flight": TimeOfFlight(),
         }
 
-    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> MeasuredOffsets:
         """Measure.
 
         Args:
@@ -158,7 +158,7 @@ class Bench:
             )
             for name, noise in self.noises().items()
         }
-        rows: list[Row] = []
+        rows: list[OffsetRow] = []
         for number, scene in enumerate(self.scenes):
             true = observe(self.camera, from_scenario(scene), self.shelf).depth
             random = np.random.default_rng([self.seed, number])
@@ -173,7 +173,7 @@ class Bench:
         settings = {
             name: getattr(self, name) for name in ("offsets", "farthest", "steepest", "deviation", "missing", "seed")
         }
-        return Measured(tuple(rows), {"scenes": [scene.name for scene in self.scenes], **settings}, versions())
+        return MeasuredOffsets(tuple(rows), {"scenes": [scene.name for scene in self.scenes], **settings}, versions())
 
     def _offset(self, random: np.random.Generator) -> Camera:
         """The camera as it is wrongly taken to be."""
@@ -185,7 +185,7 @@ class Bench:
         T[:3, 3] = np.array(self.camera.position) + self.farthest * random.uniform() * way
         return with_pose(self.camera, T)
 
-    def _row(self, scene: Scenario, noise: str, use: str, depth: np.ndarray, taken: Camera) -> Row:
+    def _row(self, scene: Scenario, noise: str, use: str, depth: np.ndarray, taken: Camera) -> OffsetRow:
         start = time.perf_counter()
         fit = fit_shelf(taken, self.shelf, depth, USES[use])
         seconds = time.perf_counter() - start
@@ -193,7 +193,7 @@ class Bench:
         _, stated, determined = correction(fit, "camera")
         scale = np.repeat([1000.0, np.degrees(1.0)], 3)
         shift, turn = _between(taken, self.camera)
-        return Row(
+        return OffsetRow(
             scenario=scene.name,
             objects=len(scene.objects),
             noise=noise,

@@ -34,7 +34,7 @@ from mechsearch_jax.workspace.scenario import Scenario
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class CeilingRow:
     """The solvability of one scene.
 
     Attributes:
@@ -151,7 +151,7 @@ class Ceiling:
 
     def row(
         self, scenario: Scenario, outcomes: Outcomes, on_round: Callable[[int, Node], None] = lambda round, best: None
-    ) -> Row:
+    ) -> CeilingRow:
         """The solvability of a scene; searched if no episode solved it and no stored result matches.
 
         Args:
@@ -163,10 +163,12 @@ class Ceiling:
           InputError: the file or picture cannot be written.
         """
         episodes, retrieved = outcomes.of(scenario)
-        row = Row(scenario.name, scenario.content_hash, len(scenario.objects), episodes, retrieved, retrieved > 0)
+        row = CeilingRow(
+            scenario.name, scenario.content_hash, len(scenario.objects), episodes, retrieved, retrieved > 0
+        )
         return row if row.solvable else self._searched(row, scenario, on_round)
 
-    def _searched(self, row: Row, scenario: Scenario, on_round: Callable[[int, Node], None]) -> Row:
+    def _searched(self, row: CeilingRow, scenario: Scenario, on_round: Callable[[int, Node], None]) -> CeilingRow:
         file = self._folder / f"{scenario.name}.json"
         identity = {"content_hash": row.content_hash, "code": present_code(), "settings": self.settings}
         columns = _stored_columns(file, identity)
@@ -183,7 +185,7 @@ class Ceiling:
 
 
 def columns_of(result: KnownSearchResult) -> dict[str, Any]:
-    """The columns of a `Row` that a search fills."""
+    """The columns of a `CeilingRow` that a search fills."""
     return {
         "actions": None if result.actions is None else len(result.actions),
         "rounds": result.rounds,
@@ -205,7 +207,7 @@ def _stored_columns(file: Path, identity: Mapping[str, Any]) -> dict[str, Any] |
     return value.get("found")
 
 
-def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[CeilingRow]) -> list[dict[str, Any]]:
     """Solvable scenes by number of objects, and of all (None), with Wilson intervals."""
     counts: list[int | None] = [*sorted({row.objects for row in rows}), None]
     lines = []
@@ -225,7 +227,7 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return lines
 
 
-def save_ceiling(rows: Sequence[Row], settings: Mapping[str, Any], command: str, path: PathLike) -> None:
+def save_ceiling(rows: Sequence[CeilingRow], settings: Mapping[str, Any], command: str, path: PathLike) -> None:
     """Write the shares and all rows as JSON.
 
     Args:

@@ -65,7 +65,7 @@ def bench_calibration(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.lab.calibration.offsets import Bench
+    from mechsearch_jax.benchmarks.lab.calibration.offsets import CalibrationBench
     from mechsearch_jax.benchmarks.lab.tables.parts_tables import calibration_table
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -75,7 +75,7 @@ def bench_calibration(
     scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
     console = Console(highlight=False)
     with console.status("looking") as status:
-        bench = Bench(scenes, offsets, seed=seed)
+        bench = CalibrationBench(scenes, offsets, seed=seed)
         measured = bench.run(lambda done: status.update(f"looking {done}/{len(scenes)}"))
     if out is not None:
         save_rows(measured.value(), measured.rows, out)

@@ -106,7 +106,7 @@ def bench_ceiling(
     keep_compilations()
     ceiling = solvability.Ceiling(out, KnownSearchConfig(**config), sequences)
     console = Console(highlight=False)
-    rows: list[solvability.Row] = []
+    rows: list[solvability.CeilingRow] = []
     with console.status("searching") as status:
         for scene in scenes:
 

@@ -63,7 +63,7 @@ def bench_looks(
                 raise InputError(f"lab looks: {file}: another scenario is named {scenario.name!r}, too; rename it")
             pictures[scenario.name] = scenario, taken(Workcell(), scenario)
             status.update(f"rendering {number + 1}/{len(files)}")
-        bench = looks.Bench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
+        bench = looks.LooksBench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
         forget_kept_compilations()
         status.update("compiling")
         measured = bench.run(lambda done: status.update(f"looking {done}/{bench.looks}"))
@@ -108,7 +108,7 @@ def bench_bodies(
         scenes[scenario.name] = scenario
     console = Console(highlight=False)
     with console.status("compiling") as status:
-        bench = bodies.Bench(scenes, tuple(dict.fromkeys(described_by)), seed)
+        bench = bodies.BodiesBench(scenes, tuple(dict.fromkeys(described_by)), seed)
         forget_kept_compilations()
         measured = bench.run(lambda done: status.update(f"looking {done}/{len(scenes)}"))
         if out is not None:

@@ -26,7 +26,7 @@ from mechsearch_jax.runtime.errors import InputError
 if TYPE_CHECKING:
     from rich.status import Status
 
-    from mechsearch_jax.benchmarks.lab.parts.recognition import Bench, Measured
+    from mechsearch_jax.benchmarks.lab.parts.recognition import MeasuredRecognition, RecognitionBench
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.workspace.scenario import Scenario
 
@@ -179,13 +179,13 @@ def bench_recognition(
 
 
 def _measured(
-    benches: Mapping[str, Bench], places: Mapping[str, Workcell], status: Status, out: Path | None
-) -> Measured:
+    benches: Mapping[str, RecognitionBench], places: Mapping[str, Workcell], status: Status, out: Path | None
+) -> MeasuredRecognition:
     """Measure in each place, and write what is measured after each: one takes minutes."""
     from mechsearch_jax.benchmarks.lab.parts.recognition import joined
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
 
-    parts: dict[str, Measured] = {}
+    parts: dict[str, MeasuredRecognition] = {}
     for name, bench in benches.items():
         total = len(bench.scenes) * len(bench.noises)
         status.update(f"{name}: compiling")
@@ -249,7 +249,7 @@ def bench_segmentation(
     console = Console(highlight=False)
     with console.status("making scenes") as status:
         everything = [*images.held_out_scenes(scenes, seed), *given]
-        bench = segmentation.Bench(everything, tuple(dict.fromkeys(noise)), seed)
+        bench = segmentation.RecognitionBench(everything, tuple(dict.fromkeys(noise)), seed)
         forget_kept_compilations()
         total = len(bench.scenes) * len(bench.noises)
         status.update("compiling")
@@ -297,7 +297,7 @@ def bench_push(
     from mechsearch_jax.train.run import counting
 
     worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
-    bench = push.Bench(push.held_out_generation(pushes, worlds, seed), models, weights)
+    bench = push.RecognitionBench(push.held_out_generation(pushes, worlds, seed), models, weights)
     for folder in (data, None if out is None else out.parent):
         if folder is not None:
             check_writable(folder)

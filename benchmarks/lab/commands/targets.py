@@ -68,9 +68,9 @@ def bench_targets(
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         made = everyday.write_things(things, seed, folder) if things else []
         given += [graspable.GivenMesh(file.stem, file) for file in made]
-        bench = graspable.Bench(given, poses, grasps, seed)
+        bench = graspable.TargetsBench(given, poses, grasps, seed)
 
-        def on_progress(rows: list[graspable.Row]) -> None:
+        def on_progress(rows: list[graspable.TargetRow]) -> None:
             status.update(f"grasping {len(rows)}/{poses * len(given)}")
             if out is not None:
                 save_rows(dict(graspable.value(bench, rows)), rows, out)

@@ -55,7 +55,7 @@ POSES, CLOUD_POINTS, AROUND, YAW, TILT = 200, 1024, 0.05, np.pi / 2, np.pi / 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class BodyRow:
     """What a description of one object is worth.
 
     Attributes:
@@ -85,7 +85,7 @@ class Row:
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class MeasuredBodies:
     """Results of a run.
 
     Attributes:
@@ -95,7 +95,7 @@ class Measured:
       versions: as `versions` returns them.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[BodyRow, ...]
     seconds: dict[str, tuple[float, ...]]
     settings: dict[str, Any]
     versions: dict[str, str]
@@ -116,7 +116,7 @@ class Measured:
     def things(self) -> list[dict[str, Any]]:
         """The same by thing, of objects that are mostly seen; the worst things by parts first."""
         rows = [row for row in self.rows if row.shown >= MOSTLY]
-        groups: dict[tuple[str, str], list[Row]] = {}
+        groups: dict[tuple[str, str], list[BodyRow]] = {}
         for row in rows:
             groups.setdefault((row.thing, row.description), []).append(row)
         lines = [
@@ -141,7 +141,7 @@ class Measured:
         }
 
 
-def figures(rows: Sequence[Row]) -> dict[str, Any]:
+def figures(rows: Sequence[BodyRow]) -> dict[str, Any]:
     """Means of rows, and intervals of two of them; at least one row."""
     names = [row.scene for row in rows]
 
@@ -179,7 +179,7 @@ class Truth:
         return np.any([inside(solid, local) for solid in self._solids], axis=0)
 
     def score(self, parts: Superquadrics) -> dict[str, Any]:
-        """The figures of `Row` for the union of parts in the world, fields (P, ...)."""
+        """The figures of `BodyRow` for the union of parts in the world, fields (P, ...)."""
         found = _union_holds(parts, self._points)
         hits = _union_holds(parts, self._cloud).reshape(POSES, -1).any(axis=1)
         return {
@@ -208,7 +208,7 @@ def _union_holds(parts: Superquadrics, points: Float[np.ndarray, "n 3"]) -> Bool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class BodiesBench:
     """A measurement of recognised bodies.
 
     Attributes:
@@ -227,13 +227,13 @@ class Bench:
         if not self.scenarios or not self.descriptions:
             raise InputError("lab bodies: there is nothing to look at; give scenes and at least one description")
 
-    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> MeasuredBodies:
         """Look at every scene and score all descriptions of its objects.
 
         Args:
           on_progress: called after every scene with the number of scenes so far.
         """
-        rows: list[Row] = []
+        rows: list[BodyRow] = []
         seconds: dict[str, list[float]] = {name: [] for name in self.descriptions if name in FITTERS}
         for index, (name, scenario) in enumerate(self.scenarios.items()):
             key = jax.random.fold_in(jax.random.key(self.seed), index)
@@ -256,7 +256,7 @@ class Bench:
         }
         # The first look compiles.
         times = {name: tuple(values[1:] or values) for name, values in seconds.items()}
-        return Measured(tuple(rows), times, settings, versions())
+        return MeasuredBodies(tuple(rows), times, settings, versions())
 
     def _seen(self, key: jax.Array, scenario: Scenario) -> tuple[LabelledImage, View, Int[np.ndarray, " n"]]:
         """The labelled image of a scene, its view, and how many pixels each object would show alone."""
@@ -298,7 +298,7 @@ def _scored(
     alone: Int[np.ndarray, " n"],
     described: Mapping[str, Superquadrics],
     seed: int,
-) -> list[Row]:
+) -> list[BodyRow]:
     """The rows of a scene."""
     rows = []
     for slot, body in enumerate(scenario.objects):
@@ -311,5 +311,5 @@ def _scored(
             one = jax.tree.map(lambda a, slot=slot: a[slot : slot + 1], objects)
             figures_of = truth.score(world_parts(one))
             shown = round(pixels / max(int(alone[slot]), 1), 4)
-            rows.append(Row(name, slot, thing, description, pixels, shown, **figures_of))
+            rows.append(BodyRow(name, slot, thing, description, pixels, shown, **figures_of))
     return rows

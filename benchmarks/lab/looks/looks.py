@@ -27,7 +27,7 @@ from mechsearch_jax.benchmarks.lab.looks.scoring import (
     TOUCHING,
     TURNED,
     Phantom,
-    Row,
+    SeenRow,
     Sighting,
     bordering,
     detection_counts,
@@ -82,7 +82,7 @@ def _volumes(truth: Superquadrics, answers: Superquadrics) -> Float[jax.Array, "
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class MeasuredLooks:
     """Results of a run.
 
     Attributes:
@@ -95,7 +95,7 @@ class Measured:
       versions: as `versions` returns them.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[SeenRow, ...]
     phantoms: tuple[Phantom, ...]
     sightings: tuple[Sighting, ...]
     seconds: dict[str, tuple[float, ...]]
@@ -110,7 +110,7 @@ class Measured:
             rows = [row for row in self.rows if (row.segments, row.noise) == (segments, noise)]
             phantoms = [p for p in self.phantoms if (p.segments, p.noise) == (segments, noise)]
             sightings = [s for s in self.sightings if (s.segments, s.noise) == (segments, noise)]
-            groups: dict[str, Sequence[Row]] = {"all": rows}
+            groups: dict[str, Sequence[SeenRow]] = {"all": rows}
             groups |= {f"{name} pixels": [r for r in rows if low <= r.pixels < high] for name, low, high in SIZES}
             groups["touching"] = [row for row in rows if row.gap < TOUCHING]
             groups["bordering in the image"] = [row for row in rows if row.gap >= TOUCHING and row.beside]
@@ -165,7 +165,7 @@ class Measured:
         }
 
 
-def figures(rows: Sequence[Row]) -> dict[str, Any]:
+def figures(rows: Sequence[SeenRow]) -> dict[str, Any]:
     """Counts of outcomes and of kinds of failures, and the mean intersection over union; at least one row."""
     wrong = [row for row in rows if row.outcome != "right"]
     outcomes = Counter(row.outcome for row in rows)
@@ -180,7 +180,7 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class LooksBench:
     """A measurement of looks.
 
     Attributes:
@@ -207,7 +207,7 @@ class Bench:
         """Number of looks."""
         return len(self.pictures) * len(self.noises) * len(self.segments)
 
-    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> MeasuredLooks:
         """Look at everything, in turn with all segments, so that their times are of the same load of the machine.
 
         Args:
@@ -218,7 +218,7 @@ class Bench:
         }
         start = next(iter(self.pictures)), self.noises[0]
         first = {kind: self.look(recogniser, kind, *start)[-1] for kind, recogniser in recognisers.items()}
-        rows: list[Row] = []
+        rows: list[SeenRow] = []
         phantoms: list[Phantom] = []
         sightings: list[Sighting] = []
         seconds: dict[Segments, list[float]] = {kind: [] for kind in recognisers}
@@ -245,7 +245,7 @@ class Bench:
             kind: round(max(first[kind] - statistics.median(seconds[kind]), 0.0), 2) for kind in seconds
         }
         times: dict[str, tuple[float, ...]] = {kind: tuple(values) for kind, values in seconds.items()}
-        return Measured(tuple(rows), tuple(phantoms), tuple(sightings), times, compiling, settings, versions())
+        return MeasuredLooks(tuple(rows), tuple(phantoms), tuple(sightings), times, compiling, settings, versions())
 
     def look(self, recogniser: Recogniser, kind: Segments, name: str, noise: str) -> tuple[Fitted, bool, float]:
         """One look: what the recogniser made of the images, whether it sees the target, and its time [s]."""
@@ -280,7 +280,7 @@ def judged(
     fitted: Fitted,
     visible: bool,
     view: Callable[[Any], Any],
-) -> tuple[list[Row], list[Phantom]]:
+) -> tuple[list[SeenRow], list[Phantom]]:
     """The outcomes of a look.
 
     Args:
@@ -310,7 +310,7 @@ def judged(
         angle = None if answer is None else turned_by(thing_of("", body), _answer(objects, answer))
         outcome = _outcome(centre, angle)
         rows.append(
-            Row(
+            SeenRow(
                 scene=scenario.name,
                 object=i,
                 objects=len(scenario.objects),

@@ -34,7 +34,7 @@ SHARED, COVERED = 0.15, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class SeenRow:
     """What became of one visible object.
 
     Attributes:
@@ -200,7 +200,7 @@ def bordering(owner: Int[np.ndarray, "h w"], slot: int) -> bool:
 
 
 def failure_kind(slot: int, owner: Int[np.ndarray, "h w"], segments: Int[np.ndarray, "h w"]) -> str:
-    """Why a visible object was not recognised, by the pixels of its segments; see `Row.kind`.
+    """Why a visible object was not recognised, by the pixels of its segments; see `SeenRow.kind`.
 
     Args:
       slot: of the object.

@@ -89,7 +89,7 @@ class Conditions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class CellRow:
     """The result of one search.
 
     Attributes:
@@ -137,7 +137,7 @@ def run_search(
     seed: int,
     max_motions: int,
     on_step: Callable[[SearchStep], None] = lambda step: None,
-) -> Row:
+) -> CellRow:
     """Run one search to its end.
 
     Args:
@@ -188,7 +188,7 @@ def run_search(
     except Exception:
         # An error ends only its search.
         ended, error = "error", traceback.format_exc()
-    return Row(
+    return CellRow(
         seed=seed,
         objects=len(cell.scenario("now").objects),
         colour=cell.workcell.colour,
@@ -264,7 +264,7 @@ def run_cell(
     conditions: Conditions,
     seeds: Sequence[int],
     on_progress: Callable[[int, str], None] = lambda done, next_search: None,
-) -> list[Row]:
+) -> list[CellRow]:
     """Run searches in the cell of a configuration file; those with a row in the folder are not run again.
 
     Args:
@@ -306,16 +306,16 @@ def run_cell(
     return rows
 
 
-def _read_row(file: Path, identity: dict[str, Any]) -> Row:
+def _read_row(file: Path, identity: dict[str, Any]) -> CellRow:
     value = read_json(file)
     if any(value.get(name) != expected for name, expected in identity.items()):
         raise InputError(f"{file}: is of another configuration, noise or code; give an empty folder with --out")
     row = value["row"]
     tuples = {name: tuple(row[name]) for name in ("colour", "idle", "actions", "seconds")}
-    return Row(**{**row, **tuples})
+    return CellRow(**{**row, **tuples})
 
 
-def summary(rows: Sequence[Row]) -> dict[str, Any]:
+def summary(rows: Sequence[CellRow]) -> dict[str, Any]:
     """Counts over all searches; the interval is Wilson's, since every search has a different scene."""
     retrieved = sum(row.retrieved for row in rows)
     steady = [second for row in rows for second in row.seconds[1:]]
@@ -336,7 +336,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def cell_table(rows: Sequence[Row]) -> Table:
+def cell_table(rows: Sequence[CellRow]) -> Table:
     """One line for every search, and the counts of all."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for name in ("seed", "objects", "found after", "motions", "failed", "phantoms", "ended"):
@@ -356,7 +356,7 @@ def cell_table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def save_rows(rows: Sequence[Row], config: Path, conditions: Conditions, command: str, path: PathLike) -> None:
+def save_rows(rows: Sequence[CellRow], config: Path, conditions: Conditions, command: str, path: PathLike) -> None:
     """Write all rows with their summary.
 
     Raises:

@@ -58,7 +58,7 @@ def held_out_generation(pushes: int, worlds: int, seed: int = 0, rounds: int = G
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class MeasuredPushes:
     """Results of a comparison.
 
     Attributes:
@@ -94,7 +94,7 @@ class Measured:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class PushBench:
     """A comparison of push models on simulated pushes.
 
     Attributes:
@@ -148,7 +148,7 @@ class Bench:
         """
         return random_pushes(self.generation, folder, self.gpu, push_scenes(), on_progress, lambda: self.simulator)
 
-    def run(self, pushes: Pushes, on_progress: Callable[[str, int], None] = lambda row, pushes: None) -> Measured:
+    def run(self, pushes: Pushes, on_progress: Callable[[str, int], None] = lambda row, pushes: None) -> MeasuredPushes:
         """Compare predictions with the simulated outcomes of pushes.
 
         Args:
@@ -176,7 +176,7 @@ class Bench:
             "nudge": NUDGE,
         }
         learned = self.models.get("learned")
-        return Measured(scores, None if learned is None else weights_of(learned), settings, versions())
+        return MeasuredPushes(scores, None if learned is None else weights_of(learned), settings, versions())
 
 
 def nudged(pushes: Pushes, seed: int = 0) -> Pushes:

@@ -39,7 +39,7 @@ NOTABLE = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class RecognitionRow:
     """One method's answer for one object.
 
     Attributes:
@@ -97,7 +97,7 @@ class Time:
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class MeasuredRecognition:
     """Results of a comparison.
 
     Attributes:
@@ -108,7 +108,7 @@ class Measured:
       versions: as `versions` returns them.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[RecognitionRow, ...]
     after: dict[str, str | None]
     times: dict[str, Time]
     settings: dict[str, Any]
@@ -117,7 +117,7 @@ class Measured:
     def summary(self) -> list[dict[str, Any]]:
         """Figures by source, noise, method and visible share: see `figures`."""
         by_key = {(row.method, *row.key): row for row in self.rows}
-        groups: dict[tuple[str, str, str], list[Row]] = {}
+        groups: dict[tuple[str, str, str], list[RecognitionRow]] = {}
         for row in self.rows:
             groups.setdefault((row.source, row.noise, row.method), []).append(row)
         lines = []
@@ -142,7 +142,7 @@ class Measured:
         }
 
 
-def figures(rows: Sequence[Row], before: Sequence[Row] | None = None) -> dict[str, Any]:
+def figures(rows: Sequence[RecognitionRow], before: Sequence[RecognitionRow] | None = None) -> dict[str, Any]:
     """Figures of answers; with `before`, the initial method's answers for the same objects, also the gain.
 
     Objects that are not "answered" count with an intersection over union of 0 and an infinite distance.
@@ -192,7 +192,7 @@ def _judge(world: World, answer: Superquadrics) -> _Judged:
     )
 
 
-def _rows(scene: Scene, noise: str, method: str, image: Look, answer: Superquadrics) -> list[Row]:
+def _rows(scene: Scene, noise: str, method: str, image: Look, answer: Superquadrics) -> list[RecognitionRow]:
     judged, image, valid, answered = jax.device_get(
         (_judge(scene.world, answer), image, scene.world.valid, answer.valid)
     )
@@ -202,7 +202,7 @@ def _rows(scene: Scene, noise: str, method: str, image: Look, answer: Superquadr
         outcome = "nothing" if not answered[i] else "answered" if judged.finite[i] else "not finite"
         good = outcome == "answered"
         rows.append(
-            Row(
+            RecognitionRow(
                 source=scene.source,
                 scene=scene.name,
                 object=int(i),
@@ -221,7 +221,7 @@ def _rows(scene: Scene, noise: str, method: str, image: Look, answer: Superquadr
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class RecognitionBench:
     """A comparison of methods on scenes; it can repeat any part of a run.
 
     Attributes:
@@ -279,14 +279,14 @@ class Bench:
             seconds[name] = time.perf_counter() - start + seconds.get(method.after or "", 0.0)
         return image, answers, seconds
 
-    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> MeasuredRecognition:
         """Recognise everything.
 
         Args:
           on_progress: called after every image with the number of images so far.
         """
         *_, first = self.answers(0, self.noises[0])
-        rows: list[Row] = []
+        rows: list[RecognitionRow] = []
         seconds: dict[str, list[float]] = {name: [] for name in self.methods}
         scene_seconds: dict[str, list[float]] = {name: [] for name in self.methods}
         done = 0
@@ -307,7 +307,7 @@ class Bench:
         settings = image_settings(self.scenes, self.noises, self.seed)
         settings |= {"ems_points": EMS_POINTS, "slow_scenes": self.slow_scenes}
         after = {name: method.after for name, method in self.methods.items()}
-        return Measured(tuple(rows), after, times, settings, versions())
+        return MeasuredRecognition(tuple(rows), after, times, settings, versions())
 
 
 def shipped_bench(
@@ -317,8 +317,8 @@ def shipped_bench(
     seed: int,
     slow_scenes: int | None,
     place: Workcell,
-) -> Bench:
-    """The `Bench` of `shipped_methods` of given names on scenes in a workcell.
+) -> RecognitionBench:
+    """The `RecognitionBench` of `shipped_methods` of given names on scenes in a workcell.
 
     Raises:
       InputError: a name is unknown, a number is impossible, the camera does not see the shelf, or the shipped weights
@@ -326,10 +326,10 @@ def shipped_bench(
     """
     view = thinned_view(place.camera, place.shelf)
     chosen = chosen_methods(shipped_methods(view.camera, place.shelf), methods)
-    return Bench(scenes, chosen, noises, seed, slow_scenes, place.shelf, place.camera)
+    return RecognitionBench(scenes, chosen, noises, seed, slow_scenes, place.shelf, place.camera)
 
 
-def joined(parts: Mapping[str, Measured], places: Mapping[str, Workcell]) -> Measured:
+def joined(parts: Mapping[str, MeasuredRecognition], places: Mapping[str, Workcell]) -> MeasuredRecognition:
     """Comparisons in several workcells as one; the source of a row is the workcell's name.
 
     Times are kept only for a single workcell, since the size of images differs between workcells.
@@ -345,7 +345,7 @@ def joined(parts: Mapping[str, Measured], places: Mapping[str, Workcell]) -> Mea
     }
     rows = tuple(row for part in parts.values() for row in part.rows)
     times = first.times if len(parts) == 1 else {}
-    return Measured(rows, first.after, times, first.settings | {"places": views}, first.versions)
+    return MeasuredRecognition(rows, first.after, times, first.settings | {"places": views}, first.versions)
 
 
 def _empty_scene() -> Superquadrics:

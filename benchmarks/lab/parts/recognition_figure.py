@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks.lab.parts.images import Shown
-from mechsearch_jax.benchmarks.lab.parts.recognition import Bench, Row
+from mechsearch_jax.benchmarks.lab.parts.recognition import RecognitionBench, RecognitionRow
 from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception.scores import sharpened
@@ -21,7 +21,7 @@ from mechsearch_jax.workspace.camera import Camera
 STYLES = {"true": (drawing.GRASPABLE, "solid"), "recognised": (drawing.TARGET, (0, (4, 1.6)))}
 
 
-def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
+def worst(rows: Sequence[RecognitionRow], method: str, count: int) -> list[RecognitionRow]:
     """The `count` answers of a method with the least intersection over union, the worst first.
 
     Raises:
@@ -33,7 +33,7 @@ def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
     return ranked[:count]
 
 
-def worst_figure(benches: Sequence[Bench], rows: Sequence[Row]) -> Figure:
+def worst_figure(benches: Sequence[RecognitionBench], rows: Sequence[RecognitionRow]) -> Figure:
     """Answers beside the truth: for each a part of the depth image, and the segment's points from above.
 
     Args:
@@ -63,7 +63,9 @@ def _slot(scene: Superquadrics, index: int) -> Superquadrics:
     return jax.tree.map(lambda a: np.asarray(a)[index : index + 1], scene)
 
 
-def _draw_panel(panel: Any, row: Row, shown: Shown, camera: Camera, drawn: Mapping[str, Superquadrics]) -> None:
+def _draw_panel(
+    panel: Any, row: RecognitionRow, shown: Shown, camera: Camera, drawn: Mapping[str, Superquadrics]
+) -> None:
     """The camera's view and the view from above, for one object."""
     depth, mask = np.asarray(shown.depth), np.asarray(shown.labels) == row.object
     panel.suptitle(

@@ -38,7 +38,7 @@ from mechsearch_jax.workspace.target import Target
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class SceneRow:
     """Statistics of one scene.
 
     Attributes:
@@ -102,7 +102,7 @@ def nearest_pose(target: Target, shelf: Shelf, pose: Float[np.ndarray, " 3"]) ->
 
 def look_at(
     source: str, scenario: Scenario, problem: Problem, camera: Camera, shelf: Shelf, exact: bool = False
-) -> Row:
+) -> SceneRow:
     """The statistics of a scene.
 
     Args:
@@ -128,7 +128,7 @@ def look_at(
             "exact_missed": int((cells & ~exists).sum()),
             "exact_poses": int(poses.sum()),
         }
-    return Row(
+    return SceneRow(
         source=source,
         scenario=scenario.name,
         content_hash=scenario.content_hash,
@@ -149,7 +149,7 @@ def look_at_all(
     sources: Mapping[str, Sequence[Scenario]],
     on_progress: Callable[[int], None] = lambda done: None,
     exact: bool = False,
-) -> list[Row]:
+) -> list[SceneRow]:
     """The statistics of the scenes of several sources.
 
     Args:
@@ -162,7 +162,7 @@ def look_at_all(
     """
     camera, shelf = Camera(), Shelf()
     problems = functools.cache(cached_problem)
-    rows: list[Row] = []
+    rows: list[SceneRow] = []
     for source, scenarios in sources.items():
         for scenario in scenarios:
             rows.append(look_at(source, scenario, problems(target_of(scenario)), camera, shelf, exact))
@@ -170,9 +170,9 @@ def look_at_all(
     return rows
 
 
-def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[SceneRow]) -> list[dict[str, Any]]:
     """Figures for each source, in the rows' order, and number of objects."""
-    groups: dict[tuple[str, int], list[Row]] = {}
+    groups: dict[tuple[str, int], list[SceneRow]] = {}
     for row in rows:
         groups.setdefault((row.source, row.objects), []).append(row)
     places = {source: i for i, source in enumerate(dict.fromkeys(row.source for row in rows))}
@@ -182,7 +182,7 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     ]
 
 
-def _figures(rows: Sequence[Row]) -> dict[str, Any]:
+def _figures(rows: Sequence[SceneRow]) -> dict[str, Any]:
     possible = [row.possible for row in rows]
     p10, p90 = np.percentile(possible, (10, 90))
     return {
@@ -204,7 +204,7 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def _by_brute_force(rows: Sequence[Row]) -> dict[str, Any]:
+def _by_brute_force(rows: Sequence[SceneRow]) -> dict[str, Any]:
     """Figures of scenes with f by brute force, too; empty if there are none."""
     if not rows:
         return {}
@@ -217,7 +217,7 @@ def _by_brute_force(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def save_scenes(rows: Sequence[Row], path: PathLike) -> None:
+def save_scenes(rows: Sequence[SceneRow], path: PathLike) -> None:
     """Write figures and rows as JSON.
 
     Raises:

@@ -91,7 +91,7 @@ _COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class SegmentRow:
     """The segmentation of one object.
 
     Attributes:
@@ -113,7 +113,7 @@ class Row:
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class MeasuredSegments:
     """Results of a run.
 
     Attributes:
@@ -124,7 +124,7 @@ class Measured:
       versions: as `versions` returns them.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[SegmentRow, ...]
     seconds: tuple[float, ...]
     compile_seconds: float
     settings: dict[str, Any]
@@ -165,7 +165,7 @@ class Measured:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class SegmentationBench:
     """A measurement on scenes; it can repeat any part of a run.
 
     Attributes:
@@ -185,7 +185,7 @@ class Bench:
     def __post_init__(self):
         check_images("lab segmentation", self.scenes, self.noises)
 
-    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> MeasuredSegments:
         """Segment everything.
 
         Args:
@@ -196,7 +196,7 @@ class Bench:
         """
         label = self._compiled()
         first = self._label(label, 0, self.noises[0])[2]
-        rows: list[Row] = []
+        rows: list[SegmentRow] = []
         seconds: list[float] = []
         for noise in self.noises:
             for index, scene in enumerate(self.scenes):
@@ -206,7 +206,7 @@ class Bench:
                 on_progress(len(seconds))
         compiling = max(first - statistics.median(seconds), 0.0)
         settings = image_settings(self.scenes, self.noises, self.seed)
-        return Measured(tuple(rows), tuple(seconds), compiling, settings, versions())
+        return MeasuredSegments(tuple(rows), tuple(seconds), compiling, settings, versions())
 
     def images(self, choice: Sequence[tuple[int, str]]) -> list[tuple[Look, np.ndarray]]:
         """Images, chosen by a scene's index and a noise, with their segmentation."""
@@ -239,11 +239,11 @@ def overlaps(labels: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.where(masks.any(axis=1), (segments & masks).sum(axis=1) / np.maximum(union, 1), np.nan)
 
 
-def _rows(scene: Scene, noise: str, image: Look, labels: np.ndarray) -> list[Row]:
+def _rows(scene: Scene, noise: str, image: Look, labels: np.ndarray) -> list[SegmentRow]:
     iou = overlaps(labels, np.asarray(image.shown.labels))
     pixels, visible, valid = jax.device_get((image.pixels, image.visible, scene.world.valid[:TARGET]))
     return [
-        Row(
+        SegmentRow(
             source=scene.source,
             scene=scene.name,
             object=int(i),
@@ -257,7 +257,7 @@ def _rows(scene: Scene, noise: str, image: Look, labels: np.ndarray) -> list[Row
     ]
 
 
-def worst_figure(bench: Bench, rows: Sequence[Row], count: int) -> Figure:
+def worst_figure(bench: SegmentationBench, rows: Sequence[SegmentRow], count: int) -> Figure:
     """The images with the least mean overlap of objects of at least 100 pixels: true masks beside segments.
 
     Raises:

@@ -45,7 +45,7 @@ Case = tuple[Scenario, Action]
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class TrajectoryRow:
     """The trajectory of one action.
 
     Attributes:
@@ -129,7 +129,7 @@ class Follower:
         return float(np.linalg.norm(apart, axis=1).max())
 
 
-def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list[Row]:
+def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list[TrajectoryRow]:
     """Plan and follow the trajectory of every case."""
     follower: Follower | None = None
     rows = []
@@ -142,7 +142,7 @@ def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list
         try:
             trajectory = whole_trajectory(setting, observation, action, speed=speed)
         except InputError as error:
-            rows.append(Row(scene.name, kind, str(error), time.perf_counter() - begin))
+            rows.append(TrajectoryRow(scene.name, kind, str(error), time.perf_counter() - begin))
             continue
         seconds, report = time.perf_counter() - begin, trajectory.report()
         follower = follower or Follower(setting, float(trajectory.time[1]))
@@ -150,11 +150,13 @@ def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list
         # No target has a place here.
         del fields["place_fault"]
         tip_error = follower.tip_error(trajectory)
-        rows.append(Row(scene.name, kind, None, seconds, **fields, within=report.within(), tip_error=tip_error))
+        rows.append(
+            TrajectoryRow(scene.name, kind, None, seconds, **fields, within=report.within(), tip_error=tip_error)
+        )
     return rows
 
 
-def summary(rows: Sequence[Row]) -> dict[str, Any]:
+def summary(rows: Sequence[TrajectoryRow]) -> dict[str, Any]:
     """Counts, highest shares and largest errors of all rows."""
     made = [row for row in rows if row.refused is None]
     numbers = ("velocity", "acceleration", "jerk", "tip_error", "duration", "seconds")

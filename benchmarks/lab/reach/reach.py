@@ -35,7 +35,7 @@ AT_ONCE = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class ReachRow:
     """The grasps of a target at one candidate pose of an empty shelf.
 
     Attributes:
@@ -55,7 +55,7 @@ class Row:
     approaches: int
 
 
-def reach(cell: Workcell, config: GraspConfig) -> list[Row]:
+def reach(cell: Workcell, config: GraspConfig) -> list[ReachRow]:
     """The rows of all candidate poses of a workcell's target.
 
     Args:
@@ -78,7 +78,7 @@ def reach(cell: Workcell, config: GraspConfig) -> list[Row]:
     reached = hand & follows
     feasible = reached & clear
     return [
-        Row(
+        ReachRow(
             *(round(float(place), 4) for place in poses[i]),
             hand=int(hand[i].sum()),
             reached=int(reached[i].sum()),
@@ -118,7 +118,7 @@ def _tests(
     return jax.vmap(jax.vmap(tested), (0, None, None))(T, tables.q7, tables.clouds)
 
 
-def bands(rows: Sequence[Row], width: float = 0.05) -> list[dict[str, Any]]:
+def bands(rows: Sequence[ReachRow], width: float = 0.05) -> list[dict[str, Any]]:
     """Means over bands across the shelf, from right to left: y from the outermost position in steps of `width` [m]."""
     y = np.array([row.y for row in rows])
     band = np.floor((y - y.min()) / width + 1e-6).astype(int)
@@ -133,7 +133,7 @@ def bands(rows: Sequence[Row], width: float = 0.05) -> list[dict[str, Any]]:
     return lines
 
 
-def save_reach(rows: Sequence[Row], config: GraspConfig, path: PathLike) -> None:
+def save_reach(rows: Sequence[ReachRow], config: GraspConfig, path: PathLike) -> None:
     """Write rows and their means as JSON.
 
     Raises:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 COLUMNS = ("objects", "IoU", "collisions right", "wrongly hit", "wrongly clear", "parts")
 
 
-def bodies_tables(measured: bodies.Measured) -> Group:
+def bodies_tables(measured: bodies.MeasuredBodies) -> Group:
     """How well recognised bodies describe the true ones, by description and by thing."""
     whole = _table("95% intervals resample scenes", "described by", "of")
     for line in measured.summary():

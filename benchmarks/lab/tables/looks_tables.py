@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.lab.looks import looks
 
 
-def looks_tables(measured: looks.Measured) -> Group:
+def looks_tables(measured: looks.MeasuredLooks) -> Group:
     """What comes of depth and colour images alone, for all segments and noises: by pixels, contact and number of
     objects, and how often objects are wrong by their stated confidence."""
     tables: list[Table] = []

@@ -13,7 +13,7 @@ from mechsearch_jax.benchmarks.lab.calibration import offsets
 from mechsearch_jax.benchmarks.lab.ceiling import solvability
 from mechsearch_jax.benchmarks.lab.parts import push, scenes, segmentation
 from mechsearch_jax.benchmarks.lab.parts.agreement import Agreement, Measures
-from mechsearch_jax.benchmarks.lab.parts.recognition import SHARES, Measured
+from mechsearch_jax.benchmarks.lab.parts.recognition import SHARES, MeasuredRecognition
 from mechsearch_jax.benchmarks.lab.reach import reach
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
 
@@ -75,7 +75,7 @@ def agreement_table(agreement: Agreement) -> Table:
     return table
 
 
-def recognition_tables(measured: Measured) -> Group:
+def recognition_tables(measured: MeasuredRecognition) -> Group:
     """How well each method recognises: a table for every source of scenes and noise, with a row for every method."""
     lines = {(line["source"], line["noise"], line["method"], line["visible"]): line for line in measured.summary()}
     tables: dict[tuple[str, str], Table] = {}
@@ -109,7 +109,7 @@ def _recognition_table(title: str) -> Table:
     return table
 
 
-def recognition_times_table(measured: Measured) -> Table:
+def recognition_times_table(measured: MeasuredRecognition) -> Table:
     """How long each method takes for an object, and on what."""
     table = plain_table()
     table.add_column("method", no_wrap=True)
@@ -127,7 +127,7 @@ def recognition_times_table(measured: Measured) -> Table:
     return table
 
 
-def segmentation_tables(measured: segmentation.Measured) -> Group:
+def segmentation_tables(measured: segmentation.MeasuredRecognition) -> Group:
     """How well objects are told apart: a table for every source of scenes and noise, by number of objects."""
     tables: dict[tuple[str, str], Table] = {}
     for line in measured.summary():
@@ -156,7 +156,7 @@ def segmentation_tables(measured: segmentation.Measured) -> Group:
     return Group(*tables.values(), Text(explanation, style="dim"))
 
 
-def calibration_table(measured: offsets.Measured) -> Group:
+def calibration_table(measured: offsets.MeasuredRecognition) -> Group:
     """How well the camera's offsets are found: a table for every sensor and use of the pixels."""
     tables, lines = [], []
     for part in measured.summary():
@@ -174,7 +174,7 @@ def calibration_table(measured: offsets.Measured) -> Group:
     return Group(*tables, Text("\n".join(lines), style="dim"))
 
 
-def push_scores_tables(measured: push.Measured) -> Group:
+def push_scores_tables(measured: push.MeasuredRecognition) -> Group:
     """How well pushes are predicted: a row for every model, and for the best by distance and by number of objects."""
     everything = {name: groups["all"] for name, groups in measured.scores.items()}
     title = f"{measured.settings['pushes']} pushes in scenes that no training has seen"
@@ -213,7 +213,7 @@ def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, 
     return table
 
 
-def scenes_table(rows: Sequence[scenes.Row]) -> Group:
+def scenes_table(rows: Sequence[scenes.SceneRow]) -> Group:
     """What scenes are like: a row for each source and number of objects."""
     table = plain_table("scenes at their start")
     table.add_column("source", no_wrap=True)
@@ -246,7 +246,7 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
     return Group(table, Text(explanation, style="dim"), *map(Text, beside_exact))
 
 
-def reach_table(rows: Sequence[reach.Row]) -> Group:
+def reach_table(rows: Sequence[reach.ReachRow]) -> Group:
     """Where a target alone on the shelf can be grasped: a row for each band across it."""
     table = plain_table("grasps of a target alone on the shelf, from its right wall to its left one")
     for name in ("y [m]", "poses", "graspable", "hand", "reached", "feasible", "approaches"):
@@ -263,7 +263,7 @@ def reach_table(rows: Sequence[reach.Row]) -> Group:
     return Group(table, Text(explanation, style="dim"))
 
 
-def ceiling_table(rows: Sequence[solvability.Row]) -> Group:
+def ceiling_table(rows: Sequence[solvability.CeilingRow]) -> Group:
     """What share of scenes can be solved: a row for each number of objects; and below it why the others were not."""
     table = plain_table("scenes that can be solved at all")
     for name in ("objects", "scenes", "in an episode", "by the search", "solvable", "95% interval"):

@@ -12,7 +12,7 @@ from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.intervals import with_interval
 
 
-def targets_table(rows: Sequence[graspable.Row]) -> Group:
+def targets_table(rows: Sequence[graspable.TargetRow]) -> Group:
     """Whether meshes are grasped wherever physics says that they can be: a line for each, and one for all."""
     table = plain_table("meshes alone on the board, at random poses")
     for name in ("mesh", "poses", "physics", "both", "planner alone", "why not"):

@@ -64,7 +64,7 @@ class GivenMesh:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class TargetRow:
     """A mesh at one pose.
 
     Attributes:
@@ -150,7 +150,7 @@ def _follows(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bench:
+class TargetsBench:
     """The comparison.
 
     Attributes:
@@ -184,7 +184,7 @@ class Bench:
         """What judges both sides: no scenes nearby, since the place is known exactly."""
         return NativeTrials(nearby=Perturbations(scenes=0))
 
-    def run(self, on_progress: Callable[[list[Row]], None] = lambda rows: None) -> list[Row]:
+    def run(self, on_progress: Callable[[list[TargetRow]], None] = lambda rows: None) -> list[TargetRow]:
         """The rows of all meshes.
 
         Args:
@@ -193,13 +193,13 @@ class Bench:
         Raises:
           InputError: a mesh cannot be a target.
         """
-        rows: list[Row] = []
+        rows: list[TargetRow] = []
         for given in self.meshes:
             rows += self.rows(given)
             on_progress(rows)
         return rows
 
-    def rows(self, given: GivenMesh) -> list[Row]:
+    def rows(self, given: GivenMesh) -> list[TargetRow]:
         """The rows of a mesh.
 
         Raises:
@@ -227,7 +227,7 @@ class Bench:
             planner = {"grasps": 0, "feasible": 0, "tried": 0, "planner": False}
             if known is not None:
                 planner = self._by_planner(mesh.target, known, pose)
-            rows.append(Row(given.name, **where, **planner, **self._in_physics(mesh, pose, rng)))
+            rows.append(TargetRow(given.name, **where, **planner, **self._in_physics(mesh, pose, rng)))
         return rows
 
     def _by_planner(self, target: Target, known: TargetGrasps, pose: Float[np.ndarray, " 3"]) -> dict[str, Any]:
@@ -290,7 +290,7 @@ class Bench:
 
 
 def _described(T_world_gripper: Float[np.ndarray, "4 4"], width: float, board: Any) -> list[float]:
-    """`Row.grasp`."""
+    """`TargetRow.grasp`."""
     R = T_world_gripper[:3, :3].astype(float)
     yaw, tilt = math.atan2(R[1, 2], R[0, 2]), math.asin(float(np.clip(-R[2, 2], -1.0, 1.0)))
     roll = math.asin(float(np.clip(R[2, 1], -1.0, 1.0)))
@@ -302,7 +302,7 @@ def _described(T_world_gripper: Float[np.ndarray, "4 4"], width: float, board: A
     ]
 
 
-def summary(rows: Sequence[Row]) -> dict[str, Any]:
+def summary(rows: Sequence[TargetRow]) -> dict[str, Any]:
     """Of the poses where physics takes a mesh out, the share where the planner does, with an interval over meshes."""
     able = [row for row in rows if row.physics]
     share = sum(row.planner for row in able) / len(able) if able else None
@@ -319,12 +319,12 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def by_mesh(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+def by_mesh(rows: Sequence[TargetRow]) -> dict[str, dict[str, Any]]:
     """The `summary` of each mesh."""
     return {name: summary([row for row in rows if row.mesh == name]) for name in dict.fromkeys(r.mesh for r in rows)}
 
 
-def about(bench: Bench) -> dict[str, Any]:
+def about(bench: TargetsBench) -> dict[str, Any]:
     """What a result depends on beside the meshes."""
     return {
         "code": present_code(),
@@ -337,6 +337,6 @@ def about(bench: Bench) -> dict[str, Any]:
     }
 
 
-def value(bench: Bench, rows: Sequence[Row]) -> Mapping[str, Any]:
+def value(bench: TargetsBench, rows: Sequence[TargetRow]) -> Mapping[str, Any]:
     """The head of a result file."""
     return {**about(bench), "summary": summary(rows), "meshes": by_mesh(rows)}
