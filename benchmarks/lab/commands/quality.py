@@ -249,7 +249,7 @@ def bench_segmentation(
     console = Console(highlight=False)
     with console.status("making scenes") as status:
         everything = [*images.held_out_scenes(scenes, seed), *given]
-        bench = segmentation.RecognitionBench(everything, tuple(dict.fromkeys(noise)), seed)
+        bench = segmentation.SegmentationBench(everything, tuple(dict.fromkeys(noise)), seed)
         forget_kept_compilations()
         total = len(bench.scenes) * len(bench.noises)
         status.update("compiling")
@@ -297,7 +297,7 @@ def bench_push(
     from mechsearch_jax.train.run import counting
 
     worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
-    bench = push.RecognitionBench(push.held_out_generation(pushes, worlds, seed), models, weights)
+    bench = push.PushBench(push.held_out_generation(pushes, worlds, seed), models, weights)
     for folder in (data, None if out is None else out.parent):
         if folder is not None:
             check_writable(folder)

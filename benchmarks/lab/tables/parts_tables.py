@@ -127,7 +127,7 @@ def recognition_times_table(measured: MeasuredRecognition) -> Table:
     return table
 
 
-def segmentation_tables(measured: segmentation.MeasuredRecognition) -> Group:
+def segmentation_tables(measured: segmentation.MeasuredSegments) -> Group:
     """How well objects are told apart: a table for every source of scenes and noise, by number of objects."""
     tables: dict[tuple[str, str], Table] = {}
     for line in measured.summary():
@@ -156,7 +156,7 @@ def segmentation_tables(measured: segmentation.MeasuredRecognition) -> Group:
     return Group(*tables.values(), Text(explanation, style="dim"))
 
 
-def calibration_table(measured: offsets.MeasuredRecognition) -> Group:
+def calibration_table(measured: offsets.MeasuredOffsets) -> Group:
     """How well the camera's offsets are found: a table for every sensor and use of the pixels."""
     tables, lines = [], []
     for part in measured.summary():
@@ -174,7 +174,7 @@ def calibration_table(measured: offsets.MeasuredRecognition) -> Group:
     return Group(*tables, Text("\n".join(lines), style="dim"))
 
 
-def push_scores_tables(measured: push.MeasuredRecognition) -> Group:
+def push_scores_tables(measured: push.MeasuredPushes) -> Group:
     """How well pushes are predicted: a row for every model, and for the best by distance and by number of objects."""
     everything = {name: groups["all"] for name, groups in measured.scores.items()}
     title = f"{measured.settings['pushes']} pushes in scenes that no training has seen"
