@@ -30,6 +30,7 @@ from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose
 from mechsearch_jax.images.checks.look import Look
 from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.images.measured import share_step
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.plausibility import image_faults
@@ -443,7 +444,10 @@ def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
     assert (searcher._now.index, searcher.moving) == (0, False)
     sees, moves = searcher.recogniser, 0
     # Whatever it comes from, what is seen is of one type.
-    shown = [jax.device_put(jax.tree.map(np.asarray, seen(scenario))) for scenario in (HIDDEN, OPEN)]
+    step = share_step(problem.camera)
+    measured = np.ones((problem.camera.height // step, problem.camera.width // step), np.float32)
+    shown = [seen(scenario).replace(measured=measured) for scenario in (HIDDEN, OPEN)]
+    shown = [jax.device_put(jax.tree.map(np.asarray, there)) for there in shown]
     looks = [lambda *images, there=there: there for there in shown]
     with CompileClock() as clock:
         for looking in (sees, *looks, sees):

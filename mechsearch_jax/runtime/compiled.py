@@ -80,9 +80,9 @@ def kept_in() -> Path | None:
 class CachedJit:
     """A jitted function that can be compiled before it is called, and is looked up on disk before it is traced.
 
-    A call uses the executable that `begin` or `prepare` made, or makes it. Inside other transformations, and for
-    arguments on another device than the first, the call goes to `jax.jit`. Arguments without an identity
-    (`runtime.identity.identity`) are compiled anew in every process.
+    A call uses the executable that `begin` or `prepare` made; where executables are kept on disk, the first call makes
+    it. Otherwise, inside other transformations, and for arguments on another device than the first, the call goes to
+    `jax.jit`. Arguments without an identity (`runtime.identity.identity`) are compiled anew in every process.
     """
 
     def __init__(
@@ -117,9 +117,20 @@ class CachedJit:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         executable = self._executable(args, kwargs)
         if executable is None:
-            return self.jitted(*args, **kwargs)
+            return self._jit()(*args, **kwargs)
         dynamic, named, _ = self._split(args, kwargs)
         return executable(*dynamic, **named)
+
+    def _jit(self) -> Any:
+        """The jitted function; outside of any trace on a CPU with `CPU_OPTIONS`, as `_compile` has it."""
+        outside = get_opaque_trace_state() == _KEEPING.untraced
+        if not outside or os.environ.get("XLA_FLAGS") or jax.default_backend() != "cpu" or not _knows_options():
+            return self.jitted
+        return self._with_options
+
+    @functools.cached_property
+    def _with_options(self) -> Any:
+        return jax.jit(self.__wrapped__, **self._options, compiler_options=CPU_OPTIONS)
 
     def __getattr__(self, name: str) -> Any:
         """Other attributes of the jitted function, such as `lower`."""
@@ -224,10 +235,12 @@ class CachedJit:
 
     def _executable(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """The executable of a call; None if it goes to `jax.jit`."""
+        if not self._loaded and _KEEPING.executables is None:
+            return None
         key = self._key(args, kwargs)
         if key is None:
             return None
-        if key not in self._loaded:
+        if key not in self._loaded and _KEEPING.executables is not None:
             self.prepare(*args, **kwargs)
         compilation = self._loaded.get(key)
         # If compiling failed in another thread, `jax.jit` raises the error in this one.
@@ -305,6 +318,16 @@ class CachedJitOnHost(CachedJit):
 
     def _signature(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str | None:
         return super()._signature(args, kwargs) if jax.default_backend() == "cpu" else None
+
+
+@functools.cache
+def _knows_options() -> bool:
+    """Whether the installed XLA knows `CPU_OPTIONS`."""
+    try:
+        jax.jit(lambda: 0).lower().compile(compiler_options=CPU_OPTIONS)
+    except Exception:
+        return False
+    return True
 
 
 def _compile(lowered: Any) -> Any:
