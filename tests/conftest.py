@@ -1,7 +1,7 @@
 """What all tests share: annotations checked at run time, strict broadcasting, kept compilations, one problem.
 
-`--slow-share K/N` selects the K-th of N parts of the slow tests, `--slow-share auto/N` the one that the commit's hash
-falls into, so that the same commit is always the same run.
+`--slow-share K/N` selects the K-th of N parts of the slow tests that are not marked `always`, `--slow-share auto/N` the
+one that the commit's hash falls into, so that the same commit is always the same run.
 """
 
 import gc
@@ -157,7 +157,8 @@ def pytest_xdist_make_scheduler(config, log):
 def pytest_collection_modifyitems(config, items):
     if config.getoption("slow_share"):
         part, parts = share_of(config.getoption("slow_share"))
-        part_of = shares.part_of_each([item.nodeid for item in items if item.get_closest_marker("slow")], parts)
+        drawn = [i.nodeid for i in items if i.get_closest_marker("slow") and not i.get_closest_marker("always")]
+        part_of = shares.part_of_each(drawn, parts)
         left_out = [item for item in items if part_of.get(item.nodeid, part) != part]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if part_of.get(item.nodeid, part) == part]
