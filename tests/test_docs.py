@@ -4,19 +4,15 @@ import importlib.util
 import json
 import math
 import re
-import statistics
 from pathlib import Path
 
 import pytest
 
 import mechsearch_jax
 from mechsearch_jax.benchmarks.lab.site import results_page
-from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
-from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45
-from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import load_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded
 from mechsearch_jax.envs.world.mismatch import ASSUMED, MISMATCH_OPTIONS
@@ -180,11 +176,6 @@ def test_every_stored_result_is_linked_from_a_guide():
     assert {file.name for file in RESULTS.glob("*.json")} - linked == set()
 
 
-def test_the_log_begins_with_the_newest():
-    dates = [title for title in headings("docs/experiments.md") if re.fullmatch(r"\d{4}-\d\d-\d\d", title)]
-    assert dates == sorted(set(dates), reverse=True) != []
-
-
 def unseen_line(run, objects, preset="standard", **settings):
     """What the default, or one before, with such settings comes to on scenes of a run that nothing was chosen on."""
     (line,) = (
@@ -236,109 +227,6 @@ def test_what_comes_of_images_stands_beside_the_papers_figures():
             assert shares["found"]["rate"] > figures.find
             assert shares["retrieved"]["rate"] > figures.grasp
         assert min(line["graspable"]["rate"], new["graspable"]["rate"]) > figures.grasp
-
-
-def stored_median(name):
-    stored = json.loads((ROOT / "benchmarks/results" / name).read_text())
-    return (stored["runs"][0] if "runs" in stored else stored)["median_seconds"]
-
-
-def test_the_times_of_a_decision_are_the_stored_ones():
-    readme = " ".join(read("README.md").split())
-    alone = "plan-farther-sides-h200.json"
-    assert f"A decision takes [{1000 * stored_median(alone):.1f} ms on one H200](benchmarks/results/{alone})" in readme
-    # With what is tried out.
-    files = list((ROOT / "benchmarks/results").glob("plan-farther-sides-rehearsal-*.json"))
-    assert len(files) == 2
-    for file in files:
-        assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme
-        assert f"](benchmarks/results/{file.name})" in readme
-    rows = load_run(RESULTS / "runs", "one-ahead-c2-h200").rows
-    batch = 1000 * sum(row.planning_seconds for row in rows) / sum(row.steps for row in rows)
-    assert f"{batch:.0f} ms in [a batch](docs/results.md#speed)" in readme
-
-
-def test_what_images_lose_is_what_is_stored():
-    readme = " ".join(read("README.md").split())
-    rows = load_run(RESULTS / "runs", "report-i-h200").rows
-    full, true = ([row for row in rows if row.recognition == seen] for seen in ("full", "oracle"))
-    assert len(same_episodes(full, true)) == len(full) == len(true) == 800
-    change, *by_count = (change_of(same_episodes(full, true, n), OUTCOMES["retrieved"]) for n in (None, 2, 4, 6, 8))
-    least, most = (100 * bound for bound in change.interval)
-    assert (
-        f"On `report-i`, `full` retrieves [{100 * change.mean:+.1f} points](docs/results.md#from-images) against true "
-        f"shapes ({least:+.1f} to {most:+.1f}), with 2, 4, 6 and 8 objects "
-        f"{', '.join(f'{100 * each.mean:+.1f}' for each in by_count[:3])} and {100 * by_count[3].mean:+.1f}."
-    ) in readme
-
-
-def test_what_household_things_cost_is_what_is_stored():
-    runs = (load_run(RESULTS / "runs", name).rows for name in ("report-household-bases-h200", "report-i-h200"))
-    things, usual = ([row for row in rows if row.objects in (4, 8)] for rows in runs)
-    assert len(things) == len(usual) == 800
-
-    def lost(seen, beside, counts=(4, 8)):
-        shares = [
-            statistics.mean(row.retrieved for row in rows if row.recognition == name and row.objects in counts)
-            for rows, name in ((usual, beside), (things, seen))
-        ]
-        return 100 * (shares[0] - shares[1])
-
-    assert (
-        "Among [household things](docs/experiments.md#household-things-and-other-worlds-on-whole-sets) "
-        f"{lost('oracle', 'oracle'):.1f} points fewer are retrieved with true shapes, {lost('full-parts', 'full'):.1f} "
-        f"from images, with 8 objects {lost('full-parts', 'full', (8,)):.1f}."
-    ) in read("README.md")
-
-
-def test_what_unknown_friction_and_shapes_cost_is_what_is_stored():
-    readme, friction, sizes = " ".join(read("README.md").split()), ("friction_spread", "mass_spread"), ("size_spread",)
-
-    def assumed(run):
-        return [row for row in load_run(RESULTS / "runs", run).rows if row.recognition == "oracle"]
-
-    def drawn(run):
-        """The rows of a run by what is drawn in their worlds."""
-        groups = {}
-        for row in load_run(RESULTS / "runs", run).rows:
-            spread = tuple(sorted(name.split(".")[1] for name in options_of(row) if name.endswith("_spread")))
-            groups.setdefault(spread, []).append(row)
-        return groups
-
-    def costs(worlds, known, counts=(2, 4, 6, 8)):
-        """Points of retrieved that each kind of world costs."""
-        counted = {name: [row for row in rows if row.objects in counts] for name, rows in worlds.items()}
-        changes = {name: change_of(same_episodes(rows, known), OUTCOMES["retrieved"]) for name, rows in counted.items()}
-        assert all(change.pairs == 200 * len(counts) for change in changes.values())
-        return {name: f"{-100 * change.mean:.1f}" for name, change in changes.items()}
-
-    known, worlds = assumed("report-i-h200"), drawn("report-i-worlds-h200")
-    today, crowded = costs(worlds, known), costs(worlds, known, (8,))
-    log = "docs/experiments.md#household-things-and-other-worlds-on-whole-sets"
-    assert (
-        f"Where friction and mass of each body are half to twice what is assumed, [{today[friction]} points "
-        f"fewer]({log}) are retrieved on `report-i`, with 8 objects {crowded[friction]}; where shapes are up to 5% "
-        f"off, {today[sizes]}."
-    ) in readme
-    as_assumed, rough, off = (
-        statistics.mean(row.retrieved for row in rows if row.objects == 8)
-        for rows in (known, worlds[friction], worlds[sizes])
-    )
-    assert (
-        f"half to twice that, [{rough:.2f} instead of {as_assumed:.2f} are retrieved with 8 objects]({log}) on "
-        f"`report-i`, where shapes are up to 5% off {off:.2f}."
-    ) in readme
-
-
-def test_what_came_of_fifty_searches_in_a_cell_is_what_is_stored():
-    stored = json.loads(read("benchmarks/results/cell-50-cpu.json"))
-    rows = stored["rows"]
-    assert all(not row["phantoms"] and not row["undetected"] and row["error"] is None for row in rows)
-    # No search ends without a line that says why.
-    assert all(row["retrieved"] or row["idle"] for row in rows)
-    retrieved = sum(row["retrieved"] for row in rows)
-    assert f"took [{retrieved} of {len(rows)} hidden targets out](" in " ".join(read("README.md").split())
-    assert stored["config"] == read("benchmarks/lab/parts/cells/other-cell.toml")
 
 
 def test_stored_scenes_are_those_on_record():
