@@ -62,7 +62,9 @@ def test_the_papers_grasps_do_not_depend_on_the_methods(problem):
         assert judge(other, here).paper_graspable == expected
 
 
-@pytest.mark.parametrize("changes", [{}, {"points": 1024}], ids=["alike", "points"])
+@pytest.mark.parametrize(
+    "changes", [{}, pytest.param({"points": 1024}, marks=pytest.mark.slow)], ids=["alike", "points"]
+)
 def test_sets_of_grasps_are_judged_together_as_each_alone(problem, changes):
     own, papers = verdicts.judged_sets(problem)
     if changes:

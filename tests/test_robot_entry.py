@@ -122,21 +122,25 @@ def x_of(q):
     return np.asarray(gripper_pose(q))[..., 0, 3]
 
 
+# What a motion is made of is an argument: of constants XLA computes much while it compiles.
+PUSHED = jax.jit(push_reference, static_argnums=3)
+
+
 @pytest.mark.parametrize("position", [DEEP, pytest.param(NEAR, marks=pytest.mark.slow)])
 def test_every_motion_begins_and_ends_outside_and_passes_its_poses(position):
     T = pose(position)
     displacement, opening = jnp.float32([0.0, -0.06, 0.0]), jnp.float32(0.08)
     place = pose((position[0] - 0.02, position[1] - 0.1, position[2]), 10.0)
     limit, plan = GRIPPER.nearest_outside + 2e-3, CONFIG
-    pushed, reachable = jax.jit(lambda: push_reference(T, displacement, Q7, plan))()
+    pushed, reachable = PUSHED(T, displacement, Q7, plan)
     assert bool(reachable)
     assert np.abs(np.asarray(gripper_pose(pushed.q)) - np.asarray(T)).max(axis=(1, 2)).min() < 2e-3
     assert in_one_configuration(pushed.q[::25])
-    taken, reachable = jax.jit(lambda: retrieve_reference(T, Q7, opening, plan))()
+    taken, reachable = jax.jit(retrieve_reference, static_argnums=3)(T, Q7, opening, plan)
     assert bool(reachable)
     np.testing.assert_allclose(gripper_pose(taken.q[int(taken.closed) - 1]), T, atol=2e-3)
     assert in_one_configuration(taken.q[::25])
-    placed, reachable = jax.jit(lambda: pick_and_place_reference(T, place, Q7, opening, plan))()
+    placed, reachable = jax.jit(pick_and_place_reference, static_argnums=4)(T, place, Q7, opening, plan)
     assert bool(reachable)
     raised = np.asarray(place).copy()
     raised[2, 3] += plan.clearance
@@ -151,7 +155,7 @@ def test_every_motion_begins_and_ends_outside_and_passes_its_poses(position):
 def test_a_push_from_outside_takes_the_old_way():
     """Where both its ends are reached from outside, nothing is added to a push but time."""
     T, displacement = pose(NEAR), jnp.float32([0.0, -0.06, 0.0])
-    reference, _ = jax.jit(lambda: push_reference(T, displacement, Q7, CONFIG))()
+    reference, _ = PUSHED(T, displacement, Q7, CONFIG)
     before = back_off(T, jnp.float32(GRIPPER.approach))
     np.testing.assert_allclose(gripper_pose(reference.start[:7]), before, atol=1e-3)
     over = int(reference.length)
