@@ -55,7 +55,8 @@ def labels_of(monkeypatch, shelf, points, view=None):
 
     monkeypatch.setattr(segmentation, "apply_network", network)
     nowhere = jnp.zeros(points.shape[:2], bool)
-    return np.asarray(NetworkSegmenter({}, None, view)(jax.random.key(0), shelf, jnp.asarray(points), nowhere))[0]
+    segmented = jax.jit(lambda points: NetworkSegmenter({}, None, view)(jax.random.key(0), shelf, points, nowhere))
+    return np.asarray(segmented(points))[0]
 
 
 def test_the_networks_nine_segments_become_eight(monkeypatch):

@@ -218,6 +218,10 @@ def identity_faults(look: Look, target_id: int | None) -> tuple[str, ...]:
     return ()
 
 
+# Operation by operation it is hundreds of programs.
+_fitted_pose = jax.jit(fitted_pose, static_argnames=("target", "shelf", "camera"))
+
+
 def colour_faults(look: Look, target: Target) -> tuple[str, ...]:
     """A warning if a colour image seems to have red and blue exchanged.
 
@@ -237,7 +241,7 @@ def colour_faults(look: Look, target: Target) -> tuple[str, ...]:
     if swapped.sum() <= least:
         return ()
     camera, points, depth = part.view.camera, jnp.asarray(part.points), jnp.asarray(part.depth)
-    pose, _ = fitted_pose(jax.random.key(0), target, shelf, camera, points, depth, jnp.asarray(swapped))
+    pose, _ = _fitted_pose(jax.random.key(0), target, shelf, camera, points, depth, jnp.asarray(swapped))
     from_target = np.abs(np.asarray(distance(target, shelf, pose, points[jnp.asarray(swapped)])))
     whole = 2 * target.half_size[0] * target.tall * (camera.fx / float(np.median(part.depth[swapped]))) ** 2
     as_large = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
