@@ -61,7 +61,7 @@ def check_image(
       InputError: an image cannot be used, or the shelf is too far from where it should be.
     """
     check_images(setting.camera, *images)
-    detector = recogniser.detector if isinstance(recogniser, Recogniser) and images.target_id is None else None
+    detector = recogniser.core.detector if isinstance(recogniser, Recogniser) and images.target_id is None else None
     look = Look(setting.camera, setting.shelf, images.depth, images.colour, images.mask, detector)
     faults = image_warnings(setting, recogniser, look, images.target_id)
     return look, [*placement_faults(setting.camera, setting.shelf, images.depth, calibration), *faults]
