@@ -229,11 +229,11 @@ def test_slots_see_their_own_holes(problem):
     slots.sense_by(dict(enumerate(sensings)))
     keys = jax.random.split(jax.random.key(0), 4)
     together = slots.look(worlds, keys, range(4))
-    valid = np.asarray(slots._state.observation.objects.valid)
+    valid = np.asarray(slots._state.search.observation.objects.valid)
     assert len({tuple(row) for row in valid}) > 1
     for row, sensing in enumerate(sensings):
         one = OneSlot(problem, Method().policy(), oracle)
         one.sense_by({0: sensing})
         alone = one.look(jax.tree.map(lambda a: a[:1], worlds), keys[row : row + 1], [0])
-        np.testing.assert_array_equal(valid[row], one.observation.objects.valid)
+        np.testing.assert_array_equal(valid[row], one.state.observation.objects.valid)
         assert (alone.size[0], alone.truth[0]) == (together.size[row], together.truth[row])

@@ -464,7 +464,7 @@ def seen_in(slots, problem, world, mismatches):
     """The poses that slots see at once, of a mismatch each."""
     slots.sense_by({row: Start(SCENE, 0, mismatch=m).sensing(problem) for row, m in enumerate(mismatches)})
     summary = slots.look(world, jax.random.split(jax.random.key(0), len(mismatches)), range(len(mismatches)))
-    return slots._state.observation.objects.position, summary
+    return slots._state.search.observation.objects.position, summary
 
 
 @pytest.mark.slow
@@ -477,7 +477,7 @@ def test_every_slot_senses_by_itself_and_numbers_compile_nothing(problem):
         one = OneSlot(problem, Method().policy(), oracle)
         one.sense_by({0: Start(SCENE, 0, mismatch=mismatch).sensing(problem)})
         alone = one.look(jax.tree.map(lambda a: a[:1], world), jax.random.split(jax.random.key(0), 1), [0])
-        np.testing.assert_allclose(many[row], one.observation.objects.position, atol=1e-6)
+        np.testing.assert_allclose(many[row], one.state.observation.objects.position, atol=1e-6)
         assert (alone.size[0], alone.truth[0]) == (summary.size[row], summary.truth[row])
     compiled = _look.jitted._cache_size()
     other, _ = seen_in(slots, problem, world, [Mismatch(camera_turn=1.0)] * 2)

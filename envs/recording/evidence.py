@@ -22,8 +22,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Problem, graspability_map, initial_belief, update_belief
-from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
-from mechsearch_jax.planner.trials import TrialResult
+from mechsearch_jax.planner.trials import TrialResult, TriedActions, nothing_tried
 from mechsearch_jax.retrieval import TargetGrasps, found_grasps, found_hits
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.session.preparing import Program, program
