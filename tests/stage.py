@@ -12,8 +12,8 @@ from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
+from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.planner import Decision, Sequences
-from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 

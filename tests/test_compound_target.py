@@ -15,16 +15,16 @@ import mechsearch_jax as ms
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.belief import with_target
-from mechsearch_jax.compound_grasps import between, grip_between
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import existence_tables
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import grasp_tables
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import grasp_tables
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.robot.gripper import Gripper, primitives_in_gripper
+from mechsearch_jax.robot.pads import between, grip_between
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import Piece, solids

@@ -20,10 +20,10 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, best_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Sequences
 from mechsearch_jax.planner.rollout import present_state
-from mechsearch_jax.retrieval import GraspChoice, best_grasp, best_grasps
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 

@@ -14,14 +14,14 @@ from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax import graspability
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
-from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.grasping import graspability
+from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper

@@ -14,8 +14,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mechsearch_jax.compound_grasps import BODY_POINTS, OpenHand, held
 from mechsearch_jax.geometry.spreading import farthest_points
+from mechsearch_jax.grasping.closings import BODY_POINTS, OpenHand, held
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, swept_cloud
 from mechsearch_jax.shapes.compound import Compound
