@@ -23,8 +23,7 @@ from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, PlannerConfig, initial_belief, prediction, search_for_grasp, update_belief
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes.box import CODE as BOX
-from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
+from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()

@@ -26,8 +26,8 @@ from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import SHAPES, by_shape, in_order, shape_of
-from mechsearch_jax.shapes.cylinder import Cylinder
+from mechsearch_jax.shapes import SHAPES, Shape, by_shape, in_order, shape_of
+from mechsearch_jax.shapes.primitives import Cylinder
 from mechsearch_jax.viz.drawing import draw_target
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, format_scenario, parse_scenario, superquadrics
@@ -39,7 +39,7 @@ SIZES = np.array([(0.03, 0.03, 0.05), (0.02, 0.06, 0.04), (0.08, 0.05, 0.02)])
 
 
 @dataclasses.dataclass(frozen=True)
-class Ball:
+class Ball(Shape):
     """A shape that the package does not have."""
 
     code: int = 2

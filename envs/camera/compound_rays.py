@@ -107,7 +107,7 @@ def _cut_in_reach(
 
 
 def cut_polyhedron(origin: list[Array], direction: list[Array], faces: Float[Array, "f 4"]) -> Float[Array, "*pixels"]:
-    """Where rays from outside enter a convex polyhedron; infinite for misses; see `shape.Shape.cut`."""
+    """Where rays from outside enter a convex polyhedron; infinite for misses; see `Primitive.cut`."""
 
     def clipped(f, span):
         near, far = span

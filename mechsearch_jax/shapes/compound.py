@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.shapes import frustum
-from mechsearch_jax.shapes.registry import PRIMITIVES
+from mechsearch_jax.shapes.primitives import PRIMITIVES
 
 if TYPE_CHECKING:
     import trimesh

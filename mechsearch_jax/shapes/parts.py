@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.shapes import frustum
 from mechsearch_jax.shapes.compound import Compound, Piece, inside, mesh, solids
-from mechsearch_jax.shapes.registry import SHAPES
+from mechsearch_jax.shapes.primitives import SHAPES
 
 # Most parts of a body.
 PARTS = 4

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, solids
-from mechsearch_jax.shapes.registry import PRIMITIVES
+from mechsearch_jax.shapes.primitives import PRIMITIVES
 
 # A solid is shrunk to no less than this share of its half-extents.
 LEAST_SHARE = 0.5
@@ -141,7 +141,7 @@ def cut(
     grown: float,
     library: Any,
 ) -> Float[Any, "*rays"]:
-    """Where rays from outside enter the body, as `shape.Shape.cut`; all solids are larger by `grown` [m]."""
+    """Where rays from outside enter the body, as `Primitive.cut`; all solids are larger by `grown` [m]."""
     values = []
     for piece in _primitives(compound):
         start, along = _local(origin, piece, True), _local(direction, piece, False)

@@ -19,7 +19,7 @@ from mechsearch_jax.runtime.identity import Uncompared
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents
 from mechsearch_jax.shapes.meshes import LEAST_THICKNESS, thickness
-from mechsearch_jax.shapes.solid import SingleShape, Solid, Union
+from mechsearch_jax.shapes.solid import Solid, solid_of
 from mechsearch_jax.workspace.compound_file import format_compound, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target_data import TargetData, target_data
@@ -172,7 +172,8 @@ class Target:
             )
         # Its colour is the detector's, whatever the compound's own.
         compound = dataclasses.replace(centred(compound)[0], colour=None)
-        return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
+        half_size = half_extents(compound)
+        return cls(COMPOUND, half_size, yaws=solid_of(compound, half_size).yaws, compound=compound)
 
     def like(self, other: Target) -> Target:
         """Another target with this one's grid and inset.
@@ -209,7 +210,7 @@ class Target:
     def solid(self) -> Solid:
         """Its geometry."""
         assert self.traced is None, "inside of a program a target of pieces is data"
-        return Union(self.compound) if self.compound else SingleShape(shape_of(self.shape), self.half_size)
+        return solid_of(self.compound or shape_of(self.shape), self.half_size)
 
     @property
     def is_compound(self) -> bool:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, half_extents, solids
 from mechsearch_jax.shapes.parts import part_rows
-from mechsearch_jax.shapes.solid import Union
+from mechsearch_jax.shapes.solid import solid_of
 
 # The number of planes of all polyhedra is rounded up to a multiple of this, and is at least so large: that of eight
 # polyhedra of 48 vertices.
@@ -35,10 +35,10 @@ class TargetData(flax.struct.PyTreeNode):
       count: number of planes.
       half_size: half-extents of the smallest box about the origin, shape (3,) [m].
       middle, half: of the smallest box around it, shape (3,) [m].
-      bottom, top, radius: of a `solid.Solid` [m].
+      bottom, top, radius: of the `Solid` [m].
       parts: of `parts.part_rows`.
       number: that identifies the compound.
-      turn, round: of a `solid.Solid`; static.
+      turn, round: of the `Solid`; static.
       primitives: its pieces that are no polyhedra; static, for they are few.
     """
 
@@ -90,7 +90,8 @@ class TargetData(flax.struct.PyTreeNode):
 @functools.lru_cache(maxsize=64)
 def target_data(compound: Compound) -> TargetData:
     """The arrays of a compound, which is centred; they must not be changed."""
-    whole = Union(compound)
+    half_size = half_extents(compound)
+    whole = solid_of(compound, half_size)
     rows = union.polyhedra(compound)
     planes, last = np.zeros((0, 4)), np.zeros(0, bool)
     if rows is not None:
@@ -105,7 +106,7 @@ def target_data(compound: Compound) -> TargetData:
         planes=planes.astype(np.float32),
         last=np.pad(last, (0, room - count)),
         count=np.int32(count),
-        half_size=np.array(half_extents(compound), np.float32),
+        half_size=np.array(half_size, np.float32),
         middle=((along - against) / 2).astype(np.float32),
         half=((along + against) / 2).astype(np.float32),
         bottom=np.float32(whole.bottom),
