@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.world.compounds import Solids
-from mechsearch_jax.envs.world.world import BODIES, CompoundWorld
+from mechsearch_jax.envs.world.world import BODIES, World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.shapes import PRIMITIVES
@@ -26,8 +26,9 @@ SLACK = 1e-3
 RAYS, POINTS = 4096, 1024
 
 
-def placed(world: CompoundWorld) -> Solids:
+def placed(world: World) -> Solids:
     """The solids of all bodies in one row each, in the world: leading axis 144; body `i // 16` owns solid i."""
+    assert world.compounds is not None
     solids = world.compounds.solids
     rotation = matmul(world.rotation[:, None], solids.rotation)
     position = rotate(world.rotation[:, None], solids.position) + world.position[:, None]
@@ -37,7 +38,7 @@ def placed(world: CompoundWorld) -> Solids:
 
 
 def cast_solids(
-    camera: Camera, world: CompoundWorld, directions: Float[Array, "*pixels 3"]
+    camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
 ) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
     """Depth along each ray [m] and the index of the first solid that it hits; infinity and `NONE` where it hits none.
 
@@ -126,7 +127,7 @@ def cut_polyhedron(origin: list[Array], direction: list[Array], faces: Float[Arr
     return jnp.where((near <= far) & (near > 0.0), near, jnp.inf)
 
 
-def solid_normals(world: CompoundWorld, points: Float[Array, "n 3"], solid: Int[Array, " n"]) -> Float[Array, "n 3"]:
+def solid_normals(world: World, points: Float[Array, "n 3"], solid: Int[Array, " n"]) -> Float[Array, "n 3"]:
     """Outward unit normals in the world at points on the surfaces of solids [m].
 
     Args:

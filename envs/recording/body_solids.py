@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World, bodies_of
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of
 from mechsearch_jax.shapes import PRIMITIVES, in_order
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, hull, solids, surface_points
 from mechsearch_jax.viz.raycast import Colour, Solid
@@ -69,7 +69,7 @@ def body_solids(world: World) -> dict[int, list[Solid]]:
     Args:
       world: NumPy arrays without leading axes.
     """
-    bodies = bodies_of(world) if isinstance(world, CompoundWorld) else [None] * BODIES
+    bodies = [None] * BODIES if world.compounds is None else bodies_of(world)
     shown = {}
     for i in np.flatnonzero(world.valid).tolist():
         body = bodies[i]
@@ -105,7 +105,7 @@ def moved(solid: Solid, rotation: Float[np.ndarray, "3 3"], position: Float[np.n
 
 def body_points(world: World) -> dict[int, Float[np.ndarray, "points 3"]]:
     """Points whose hull contains each body that is there, by slot, in its own frame [m]; see `body_solids`."""
-    bodies = bodies_of(world) if isinstance(world, CompoundWorld) else [None] * BODIES
+    bodies = [None] * BODIES if world.compounds is None else bodies_of(world)
     points = {}
     for i in np.flatnonzero(world.valid).tolist():
         body = bodies[i]

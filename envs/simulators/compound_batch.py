@@ -23,12 +23,10 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.compounds import Matter, Solids
+from mechsearch_jax.envs.world.compounds import Compounds, Matter, Solids
 from mechsearch_jax.envs.world.world import (
     BODIES,
     TARGET,
-    CompoundWorld,
-    TargetCompoundWorld,
     World,
     alike,
     as_compounds,
@@ -60,18 +58,18 @@ def room_for(world: World) -> Mapping[int, Compound]:
 
     A target that is a compound is in the model itself, with its meshes: all worlds have the same.
     """
-    if isinstance(world, TargetCompoundWorld):
-        return {**ROOM, TARGET: world.target}
-    return ROOM if isinstance(world, CompoundWorld) else {}
+    if world.target is not None:
+        return {**ROOM, TARGET: world.target.made_of}
+    return {} if world.compounds is None else ROOM
 
 
-def check_room(world: CompoundWorld) -> None:
+def check_room(compounds: Compounds) -> None:
     """Check that the solids of objects fit into the model's rows.
 
     Raises:
       InputError: they do not, or there is a convex polyhedron.
     """
-    solids = jax.device_get(world.compounds.solids)
+    solids = jax.device_get(compounds.solids)
     kind, valid = (np.asarray(leaf)[..., :TARGET, :] for leaf in (solids.kind, solids.valid))
     if (valid & (kind == CONVEX_CODE)).any():
         raise InputError("MjxSimulator: meshes and convex polyhedra cannot be simulated here; use the NativeSimulator")
@@ -94,17 +92,17 @@ def fitting(world: World, room: Mapping[int, Compound]) -> World:
       InputError: there are compounds and no room for them, or more solids of a kind than there is room for, or the
         target is another one.
     """
-    if not isinstance(world, CompoundWorld):
+    if world.compounds is None:
         return _as_compounds(world) if room else world
     if not room:
         raise InputError("MjxSimulator: there are compounds among plain worlds; run them one set after the other")
     if room_for(world).get(TARGET) != room.get(TARGET):
         raise InputError("MjxSimulator: the worlds differ in their target; run them one set after the other")
-    check_room(world)
+    check_room(world.compounds)
     return world
 
 
-def _as_compounds(world: World) -> CompoundWorld:
+def _as_compounds(world: World) -> World:
     rows = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], world) for i in range(len(world.kind))]
     return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *(as_compounds(row) for row in rows))
 
@@ -125,15 +123,17 @@ def like_present(present: World | None, scenario: Scenario) -> World:
     return world
 
 
-def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -> CompoundFields:
+def compound_fields(blank: mujoco.MjModel, world: World, cells: Cells) -> CompoundFields:
     """The fields of a model whose slots hold the compounds of each world, float32; traceable.
 
     Args:
       blank: the compiled model with `ROOM`.
-      world: fields with a leading axis for the worlds.
+      world: with `compounds`; fields with a leading axis for the worlds.
       cells: of the worlds.
     """
-    plain = _plain_fields(blank, world, cells)
+    compounds = world.compounds
+    assert compounds is not None
+    plain = _plain_fields(blank, world, compounds.matter, cells)
     fields = {name: getattr(plain, name) for name in BodyFields.__dataclass_fields__}
     worlds = len(world.kind)
     for name in ("geom_pos", "geom_quat", "body_iquat"):
@@ -143,9 +143,7 @@ def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -
     def put(name: str, where: np.ndarray, value: Array) -> None:
         fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))
 
-    objects: tuple[Solids, Matter] = jax.tree.map(
-        lambda leaf: leaf[:, :TARGET], (world.compounds.solids, world.compounds.matter)
-    )
+    objects: tuple[Solids, Matter] = jax.tree.map(lambda leaf: leaf[:, :TARGET], (compounds.solids, compounds.matter))
     solids, matter = objects
     there = world.valid[:, :TARGET]
     friction = cells.friction[:, None] * cells.body_friction[:, :TARGET] * matter.friction
@@ -163,17 +161,16 @@ def compound_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -
         sliding = jnp.broadcast_to(friction[..., None], used.shape).reshape(worlds, -1)
         fields["geom_friction"] = fields["geom_friction"].at[:, flat, 0].set(sliding)
     body = np.array([blank.body(f"body{i}").id for i in range(BODIES)])
-    axes = world.compounds.matter.axes
+    axes = compounds.matter.axes
     identity = jnp.broadcast_to(jnp.eye(3), axes.shape)
     put("body_iquat", body, _quaternions(jnp.where(world.valid[..., None, None], axes, identity)))
     return CompoundFields(**fields)
 
 
-def _plain_fields(blank: mujoco.MjModel, world: CompoundWorld, cells: Cells) -> BodyFields:
+def _plain_fields(blank: mujoco.MjModel, world: World, matter: Matter, cells: Cells) -> BodyFields:
     """`body_fields` with the masses of compounds, and the geometry of the target alone, if that is no compound."""
-    matter = world.compounds.matter
     weights = matter.mass, matter.moments
-    if not isinstance(world, TargetCompoundWorld):
+    if world.target is None:
         return body_fields(blank, world.kind, world.half_size, world.valid, cells, weights, range(TARGET, TARGET + 1))
     plain = body_fields(blank, world.kind, world.half_size, world.valid, cells, weights, range(BODIES, BODIES))
     geoms = np.flatnonzero(models.geometry_slots(blank) == TARGET)

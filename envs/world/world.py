@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import flax.struct
 import jax
@@ -18,7 +18,6 @@ from mechsearch_jax.envs.world.compounds import Compounds, body_at, body_of, com
 from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.identity import Uncompared
 from mechsearch_jax.shapes import Shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, half_extents
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
@@ -28,7 +27,7 @@ TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
 # A target that leans further than this has fallen over [rad].
 MAX_TILT = math.radians(15)
-# Steps of `TargetCompoundWorld.room` [m].
+# Steps of `CompoundTarget.room` [m].
 ROOM = 0.02
 
 
@@ -38,15 +37,31 @@ def fallen_over(rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True) -> 
     return bool(upright < math.cos(MAX_TILT))
 
 
-class World(flax.struct.PyTreeNode):
-    """All bodies on the shelf. Every field has the leading axes (..., 9): eight slots for objects, then the target.
+@dataclasses.dataclass(frozen=True)
+class CompoundTarget:
+    """A target that is a compound, as a world knows it; equal for targets with the same room.
 
     Attributes:
-      kind: code of the body's shape (`shapes.Shape`), int32.
-      half_size: half-extents along the body's own axes [m], shape (..., 9, 3).
+      room: half-extents of a box that has room for it, in steps of `ROOM` [m].
+      made_of: the target; no program depends on it, and it is not for use inside of one.
+    """
+
+    room: tuple[float, float, float]
+    made_of: Compound = dataclasses.field(compare=False)
+
+
+class World(flax.struct.PyTreeNode):
+    """All bodies on the shelf. Arrays have the leading axes (..., 9): eight slots for objects, then the target.
+
+    Attributes:
+      kind: code of the body's shape (`shapes.Shape`), int32; of a compound that of the box around it.
+      half_size: half-extents along the body's own axes [m], shape (..., 9, 3); of a compound those of the box about its
+        centre of mass that contains it.
       position: `t_world_body` [m], shape (..., 9, 3).
       rotation: `R_world_body`, shape (..., 9, 3, 3).
       valid: whether the slot holds a body.
+      compounds: what the bodies are made of; None if none is a compound, so that programs stay what they are.
+      target: a target that is a compound, else None. Static: worlds side by side have the same.
     """
 
     kind: jax.Array
@@ -54,35 +69,8 @@ class World(flax.struct.PyTreeNode):
     position: jax.Array
     rotation: jax.Array
     valid: jax.Array
-
-
-class CompoundWorld(World):
-    """A world of which some bodies are compounds; see `World`.
-
-    Kind and half size of a compound are those of the box about its centre of mass that contains it.
-
-    Attributes:
-      compounds: what the bodies are made of.
-    """
-
-    compounds: Compounds
-
-
-class TargetCompoundWorld(CompoundWorld):
-    """A world whose target is a compound; see `CompoundWorld`.
-
-    Attributes:
-      made_of: the target. Static: worlds side by side have the same; but programs do not depend on it.
-      room: half-extents of a box that has room for it, in steps of `ROOM` [m]; static.
-    """
-
-    made_of: Uncompared[Compound] = flax.struct.field(pytree_node=False)
-    room: tuple[float, float, float] = flax.struct.field(pytree_node=False)
-
-    @property
-    def target(self) -> Compound:
-        """What the target is made of; not for use inside of a program."""
-        return self.made_of.value
+    compounds: Compounds | None = None
+    target: CompoundTarget | None = flax.struct.field(pytree_node=False, default=None)
 
 
 def slots(scenario: Scenario) -> list[Body | None]:
@@ -98,7 +86,7 @@ def slots(scenario: Scenario) -> list[Body | None]:
 
 
 def from_scenario(scenario: Scenario) -> World:
-    """The world of a scenario: a `CompoundWorld` if it has compounds, a `TargetCompoundWorld` if the target is one.
+    """The world of a scenario.
 
     Raises:
       InputError: there are more objects than slots, or a shape that cannot stand beside compounds.
@@ -118,13 +106,13 @@ def from_scenario(scenario: Scenario) -> World:
     return _of_compounds(world, bodies)
 
 
-def _of_compounds(world: World, bodies: Sequence[Body | None]) -> CompoundWorld:
+def _of_compounds(world: World, bodies: Sequence[Body | None]) -> World:
     """A plain world as one of the compounds that the bodies in its slots are."""
-    fields, target = {**_fields(world), "compounds": compounds_of(bodies)}, bodies[TARGET]
+    world, target = world.replace(compounds=compounds_of(bodies)), bodies[TARGET]
     if target is None or target.compound is None:
-        return CompoundWorld(**fields)
+        return world
     x, y, z = (round(math.ceil(half / ROOM - 1e-6) * ROOM, 3) for half in half_extents(target.compound))
-    return TargetCompoundWorld(**fields, made_of=Uncompared(target.compound), room=(x, y, z))
+    return world.replace(target=CompoundTarget((x, y, z), target.compound))
 
 
 def with_target(world: World, target: Target) -> World:
@@ -134,7 +122,7 @@ def with_target(world: World, target: Target) -> World:
       world: fields without further leading axes.
       target: of the search.
     """
-    if target.compound is None or isinstance(world, TargetCompoundWorld):
+    if target.compound is None or world.target is not None:
         return world
     bodies = bodies_of(world)
     bodies[TARGET] = Body(COMPOUND, target.half_size, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), target.compound)
@@ -146,10 +134,6 @@ def outer_shape(body: Body | Target) -> Shape:
     return in_order()[0] if body.shape == COMPOUND else shape_of(body.shape)
 
 
-def _fields(world: World) -> dict[str, Any]:
-    return {name: getattr(world, name) for name in World.__dataclass_fields__}
-
-
 def alike(worlds: Sequence[World]) -> list[World]:
     """The worlds with the same leaves, so that they can be stacked: all of compounds if one is.
 
@@ -159,16 +143,17 @@ def alike(worlds: Sequence[World]) -> list[World]:
     Raises:
       InputError: a body has a shape that cannot stand beside compounds.
     """
-    if not any(isinstance(world, CompoundWorld) for world in worlds):
+    if all(world.compounds is None for world in worlds):
         return list(worlds)
     made = [as_compounds(world) for world in worlds]
-    if any(world.compounds.solids.faces.shape[-2] for world in made):
-        return [world.replace(compounds=with_polyhedra(world.compounds)) for world in made]
-    return [*made]
+    of_all = [world.compounds for world in made if world.compounds is not None]
+    if any(compounds.solids.faces.shape[-2] for compounds in of_all):
+        return [world.replace(compounds=with_polyhedra(own)) for world, own in zip(made, of_all, strict=True)]
+    return made
 
 
-def as_compounds(world: World) -> CompoundWorld:
-    """A world as one of compounds; a plain body is a single solid.
+def as_compounds(world: World) -> World:
+    """A world that has `compounds`; a plain body is a single solid.
 
     Args:
       world: fields without further leading axes.
@@ -176,9 +161,7 @@ def as_compounds(world: World) -> CompoundWorld:
     Raises:
       InputError: a body has a shape that cannot stand beside compounds.
     """
-    if isinstance(world, CompoundWorld):
-        return world
-    return _of_compounds(world, bodies_of(world))
+    return world if world.compounds is not None else _of_compounds(world, bodies_of(world))
 
 
 def bodies_of(world: World) -> list[Body | None]:
@@ -190,14 +173,13 @@ def bodies_of(world: World) -> list[Body | None]:
     host = jax.device_get(world)
     quaternions = Rotation.from_matrix(np.where(host.valid[:, None, None], host.rotation, np.eye(3))).as_quat()
     quaternions = quaternions[:, [3, 0, 1, 2]]
-    made = host.compounds if isinstance(host, CompoundWorld) else None
 
     def body(i: int) -> Body:
         pose = host.position[i].tolist(), quaternions[i].tolist()
-        if i == TARGET and isinstance(host, TargetCompoundWorld):
-            return body_at(host.target, pose)
-        if made is not None and made.compound[i]:
-            return body_of(made, i, pose)
+        if i == TARGET and host.target is not None:
+            return body_at(host.target.made_of, pose)
+        if host.compounds is not None and host.compounds.compound[i]:
+            return body_of(host.compounds, i, pose)
         return Body(
             in_order()[host.kind[i]].name,
             *(tuple(float(v) for v in values) for values in (host.half_size[i], host.position[i])),  # pyright: ignore
@@ -209,7 +191,7 @@ def bodies_of(world: World) -> list[Body | None]:
 
 def superquadrics(world: World) -> Superquadrics:
     """The true superquadrics of all bodies, the target last; of a world with compounds bodies of several parts."""
-    if isinstance(world, CompoundWorld):
+    if world.compounds is not None:
         scene = of_parts(world.compounds.parts, world.position, world.rotation)
         return scene.replace(valid=scene.valid & world.valid)
     exponents = jnp.array([shape.exponents for shape in in_order()])
@@ -222,10 +204,10 @@ def plain_objects(world: World) -> World:
     Objects of a plain world are superquadrics without parts, with which all of a planner's programs are half as large.
     Inside of programs, where it is not known which bodies are compounds, the world stays as it is.
     """
-    if not isinstance(world, CompoundWorld) or isinstance(world.compounds.compound, Tracer):
+    if world.compounds is None or isinstance(world.compounds.compound, Tracer):
         return world
     objects = np.asarray(world.compounds.compound)[..., :TARGET]
-    return world if objects.any() else World(**_fields(world))
+    return world if objects.any() else world.replace(compounds=None, target=None)
 
 
 def true_superquadrics(world: World) -> Superquadrics:
