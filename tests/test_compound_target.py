@@ -34,8 +34,8 @@ from mechsearch_jax.viz.drawing import draw_target, target_points
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.swept_target import swept_target
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import swept_target
 
 TARGETS = {name: Target.from_parts(pieces) for name, pieces in (("bottle", BOTTLE), ("cup", CUP), ("tee", TEE))}
 CAMERA, SHELF = Camera(), Shelf()

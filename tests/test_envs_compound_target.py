@@ -39,8 +39,7 @@ from mechsearch_jax.workspace import scenario as scenarios
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
-from mechsearch_jax.workspace.target_file import load_target
+from mechsearch_jax.workspace.target import Target, load_target
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 SHELF = Shelf()

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.envs.world.compounds import Solids
-from mechsearch_jax.envs.world.world import BODIES, World
+from mechsearch_jax.envs.world.world import BODIES, Solids, World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.shapes import PRIMITIVES

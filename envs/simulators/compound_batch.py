@@ -23,10 +23,12 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
 from mechsearch_jax.envs.world import model as models
-from mechsearch_jax.envs.world.compounds import Compounds, Matter, Solids
 from mechsearch_jax.envs.world.world import (
     BODIES,
     TARGET,
+    Compounds,
+    Matter,
+    Solids,
     World,
     alike,
     as_compounds,

@@ -36,8 +36,8 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import Compound
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.swept_target import swept_target
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import swept_target
 
 # Number of points of a cloud that are tested first.
 COARSE = 256

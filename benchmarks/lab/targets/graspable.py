@@ -40,7 +40,7 @@ from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes.compound import centred
-from mechsearch_jax.workspace.compound_file import parse_compound
+from mechsearch_jax.workspace.scenario import parse_compound
 from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
 
 # Where targets stand: x and y [m], as objects of generated scenes.
