@@ -11,8 +11,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.scenes.household import body_at, household, standing_height
-from mechsearch_jax.envs.simulators.batch_model import cells_of
-from mechsearch_jax.envs.simulators.compound_batch import ROOM, ROWS, check_room, compound_fields, fitting, like_present
+from mechsearch_jax.envs.simulators.batch_model import (
+    ROOM,
+    ROWS,
+    cells_of,
+    check_room,
+    compound_fields,
+    fitting,
+    like_present,
+)
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model

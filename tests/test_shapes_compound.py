@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError, Note
-from mechsearch_jax.shapes import PRIMITIVES, frustum, meshes
+from mechsearch_jax.shapes import PRIMITIVES, meshes
 from mechsearch_jax.shapes import compound as compounds
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
 from mechsearch_jax.shapes.meshes import convex_pieces, joined, thinned
@@ -101,8 +101,10 @@ def test_what_a_capsule_cannot_be_is_said():
 @pytest.mark.parametrize("ends", [(0.03, 0.05), (0.05, 0.01), (0.03, 0.03)])
 def test_a_frustum_is_a_stack_of_discs_of_its_volume(ends):
     low, high = ends
-    stack = frustum.discs((low, high, 0.04))
-    assert len(stack) == min(max(int(np.ceil(round(abs(high - low) / frustum.STEP, 9))), 1), frustum.MOST)
+    stack = compounds.discs((low, high, 0.04))
+    assert len(stack) == min(
+        max(int(np.ceil(round(abs(high - low) / compounds.DISC_STEP, 9))), 1), compounds.MOST_DISCS
+    )
     exact = np.pi * 0.08 * (low**2 + low * high + high**2) / 3
     assert sum(np.pi * r**2 * 2 * half for _, r, half in stack) == pytest.approx(exact)
     bottoms = [z - half for z, _, half in stack]
@@ -405,4 +407,4 @@ def test_few_corners_are_left_of_many():
 
 
 def test_the_names_of_shapes_do_not_meet():
-    assert not {COMPOUND, CONVEX, frustum.NAME} & set(PRIMITIVES)
+    assert not {COMPOUND, CONVEX, compounds.FRUSTUM} & set(PRIMITIVES)

@@ -20,8 +20,7 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool
 
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
-from mechsearch_jax.envs.simulators.compound_batch import CompoundFields, compound_fields
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, CompoundFields, body_fields, compound_fields
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
 from mechsearch_jax.envs.simulators.warp_streams import keep_streams

@@ -35,8 +35,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of
-from mechsearch_jax.envs.simulators.compound_batch import fitting, like_present, room_for
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of, fitting, like_present, room_for
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.simulators.mjx_step import (
     Progress,

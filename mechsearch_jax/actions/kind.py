@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol
 
 import jax
@@ -9,13 +10,29 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.config import ActionSpace
-from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.footprints import Footprints
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.motion import MotionConfig, Reference
+
+
+@dataclasses.dataclass(frozen=True)
+class Sketch:
+    """Lines in the world; every part may be missing.
+
+    Attributes:
+      hands: poses of the gripper, first where the action begins, shape (k, 4, 4) [m].
+      opening: distance between its fingers [m].
+      path: path of the hand or of the object in it, drawn as an arrow, shape (points, 3) [m].
+      takes_target: whether the target moves along the path.
+    """
+
+    hands: Float[np.ndarray, "k 4 4"] | None = None
+    opening: float = 0.0
+    path: Float[np.ndarray, "points 3"] | None = None
+    takes_target: bool = False
 
 
 class Kind(Protocol):

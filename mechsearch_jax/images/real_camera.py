@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.camera_pose import PoseConfig, PoseEstimate, estimate_pose
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane

@@ -13,7 +13,7 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.path import Path
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.gripper import HAND, Primitive, fingers
 from mechsearch_jax.robot.kinematics import FINGER_TIPS

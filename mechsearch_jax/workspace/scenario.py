@@ -23,12 +23,14 @@ from mechsearch_jax.geometry.bodies import bodies_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import read_json, replacing
-from mechsearch_jax.shapes import PRIMITIVES, frustum, shape_of
+from mechsearch_jax.shapes import PRIMITIVES, shape_of
 from mechsearch_jax.shapes.compound import (
     COMPOUND,
     CONVEX,
+    FRUSTUM,
     IDENTITY,
     LEAST_VOLUME,
+    MOST_DISCS,
     MOST_SOLIDS,
     MOST_VERTICES,
     Compound,
@@ -49,7 +51,7 @@ LEAST, LARGEST = 1e-3, 0.5
 DENSITIES = (1.0, 25_000.0)
 FRICTIONS = (0.0, 5.0)
 SCALES = (1e-6, 1e3)
-_SHAPES = (*PRIMITIVES, frustum.NAME, CONVEX)
+_SHAPES = (*PRIMITIVES, FRUSTUM, CONVEX)
 _SHARED = ("density", "friction")
 FORMAT = "mechsearch-scenario"
 # Version 2 has bodies of several pieces; what needs none is written as version 1.
@@ -174,7 +176,7 @@ def _pieces(value: Any, where: str) -> tuple[Piece, ...]:
     if (count := len(solids(pieces))) > MOST_SOLIDS:
         raise InputError(
             f"{where}: {count} solids are too many, at most {MOST_SOLIDS} can be simulated; a frustum counts as up to"
-            f" {frustum.MOST}"
+            f" {MOST_DISCS}"
         )
     return pieces
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.actions.types import Action, Prediction
 
 CODE = 0

@@ -19,9 +19,9 @@ from mechsearch_jax.actions.approach import (
     swept_places,
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.actions.kinds.object_grasps import grasp_variants, object_grasps
 from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
-from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.rigid import held_pose, pick_and_place

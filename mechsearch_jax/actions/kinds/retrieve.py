@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.actions.types import Action, Prediction
 from mechsearch_jax.robot.motion import MotionConfig, Reference, retrieve_reference
 
