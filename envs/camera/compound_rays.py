@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.envs.world.world import BODIES, Solids, World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.transforms import matmul, rotate
-from mechsearch_jax.shapes import PRIMITIVES
+from mechsearch_jax.shapes import PRIMITIVES, union
 from mechsearch_jax.shapes.compound import CONVEX_CODE, MOST_SOLIDS
 from mechsearch_jax.workspace.camera import Camera
 
@@ -109,21 +109,12 @@ def _cut_in_reach(
 def cut_polyhedron(origin: list[Array], direction: list[Array], faces: Float[Array, "f 4"]) -> Float[Array, "*pixels"]:
     """Where rays from outside enter a convex polyhedron; infinite for misses; see `Primitive.cut`."""
 
-    def clipped(f, span):
-        near, far = span
-        face = faces[f]
-        along = face[0] * direction[0] + face[1] * direction[1] + face[2] * direction[2]
-        height = face[3] - face[0] * origin[0] - face[1] * origin[1] - face[2] * origin[2]
-        safe = jnp.where(jnp.abs(along) < 1e-12, 1e-12, along)
-        where = height / safe
-        return (
-            jnp.where(safe < 0.0, jnp.maximum(near, where), near),
-            jnp.where(safe > 0.0, jnp.minimum(far, where), far),
-        )
+    def crossed(f, state):
+        return union.crossed(faces[f, :3], faces[f, 3], origin, direction, state, jnp)
 
-    everywhere = jnp.zeros_like(direction[0])
-    near, far = jax.lax.fori_loop(0, len(faces), clipped, (everywhere - jnp.inf, everywhere + jnp.inf))
-    return jnp.where((near <= far) & (near > 0.0), near, jnp.inf)
+    start = jnp.full_like(direction[0], jnp.inf), jnp.zeros_like(direction[0])
+    near, far = jax.lax.fori_loop(0, len(faces), crossed, start)
+    return union.entry(near, far, jnp)
 
 
 def solid_normals(world: World, points: Float[Array, "n 3"], solid: Int[Array, " n"]) -> Float[Array, "n 3"]:

@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of
-from mechsearch_jax.shapes import PRIMITIVES, in_order
+from mechsearch_jax.shapes import PRIMITIVES, in_order, union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, hull, solids, surface_points
+from mechsearch_jax.shapes.primitives import Primitive
 from mechsearch_jax.viz.raycast import Colour, Solid
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Polyhedron:
+class Polyhedron(Primitive):
     """A convex polyhedron as a surface of pictures, whatever half-extents are said.
 
     Attributes:
@@ -34,26 +35,18 @@ class Polyhedron:
     def cut(
         self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
     ) -> Float[Any, "*rays"]:
-        """See `shapes.Shape.cut`."""
-        near, far = library.full_like(direction[0], -np.inf), library.full_like(direction[0], np.inf)
-        for x, y, z, reach in self.planes.tolist():
-            along = x * direction[0] + y * direction[1] + z * direction[2]
-            height = reach - x * origin[0] - y * origin[1] - z * origin[2]
-            safe = library.where(library.abs(along) < 1e-12, 1e-12, along)
-            where = height / safe
-            near = library.where(safe < 0.0, library.maximum(near, where), near)
-            far = library.where(safe > 0.0, library.minimum(far, where), far)
-        return library.where((near <= far) & (near > 0.0), near, np.inf)
+        near, far = library.full_like(direction[0], np.inf), library.full_like(direction[0], 0.0)
+        for *normal, offset in self.planes.tolist():
+            near, far = union.crossed(normal, offset, origin, direction, (near, far), library)
+        return union.entry(near, far, library)
 
     def normal(
         self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
     ) -> Float[Any, "*batch 3"]:
-        """See `shapes.Shape.normal`."""
         above = point @ self.planes[:, :3].T - self.planes[:, 3]
         return self.planes[:, :3][library.argmax(above, axis=-1)]
 
     def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
-        """Its surface in its own frame."""
         return hull(self.piece).copy()
 
 

@@ -112,7 +112,7 @@ def _fold(step: Callable[[Any, Any], Any], start: Any, rows: tuple[Any, ...], li
     return jax.lax.scan(lambda state, row: (step(state, row), None), start, cast)[0]
 
 
-def _product(normal: Float[Any, " 3"], vector: Sequence[Any]) -> Any:
+def _product(normal: Any, vector: Sequence[Any]) -> Any:
     return vector[0] * normal[0] + vector[1] * normal[1] + vector[2] * normal[2]
 
 

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mechsearch_jax.shapes.primitives import Primitive
 from mechsearch_jax.workspace.camera import Camera
-
-if TYPE_CHECKING:
-    import trimesh
 
 # A solid nearer to the camera's plane than this is cast in the whole image [m].
 NEAREST = 0.02
@@ -26,20 +23,6 @@ NEAREST = 0.02
 RAYS = 2
 
 Colour = tuple[float, float, float]
-
-
-class Surface(Protocol):
-    """The methods of `shapes.Shape` that ray casting needs; `Capsule` has them, too."""
-
-    def cut(
-        self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
-    ) -> Float[Any, "*rays"]: ...
-
-    def normal(
-        self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
-    ) -> Float[Any, "*batch 3"]: ...
-
-    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,7 +37,7 @@ class Solid:
       colour: red, green and blue, 0 to 1.
     """
 
-    surface: Surface
+    surface: Primitive
     half_size: Float[np.ndarray, " 3"]
     rotation: Float[np.ndarray, "3 3"]
     position: Float[np.ndarray, " 3"]

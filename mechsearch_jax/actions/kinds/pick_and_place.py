@@ -19,7 +19,7 @@ from mechsearch_jax.actions.approach import (
     swept_places,
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace
-from mechsearch_jax.actions.kind import Sketch
+from mechsearch_jax.actions.kind import SampledKind, Sketch
 from mechsearch_jax.actions.kinds.object_grasps import grasp_variants, object_grasps
 from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
@@ -54,14 +54,13 @@ def _object_hits(T, owner, held, scene, clouds, distance, mask):
 
 
 @dataclasses.dataclass(frozen=True)
-class PickAndPlace:
-    """A `kind.SampledKind`: a side grasp, and a random free place."""
+class PickAndPlace(SampledKind):
+    """A side grasp, and a random free place."""
 
     code: int = CODE
     name: str = "pick-and-place"
     moves_object: bool = True
     holds_object: bool = True
-    takes_target: bool = False
     returns_home: bool = True
     opening: int = OPEN
     surrounds_object: bool = True

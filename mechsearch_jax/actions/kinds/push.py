@@ -22,7 +22,7 @@ from mechsearch_jax.actions.approach import (
     object_clouds,
 )
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace
-from mechsearch_jax.actions.kind import Sketch
+from mechsearch_jax.actions.kind import SampledKind, Sketch
 from mechsearch_jax.actions.kinds.object_grasps import PASSING_GAP
 from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
@@ -308,14 +308,12 @@ def _in_words(displacement: Float[np.ndarray, " 3"]) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Push:
-    """A `kind.SampledKind`: a push in one of a few directions by one of a few distances."""
+class Push(SampledKind):
+    """A push in one of a few directions by one of a few distances."""
 
     code: int = CODE
     name: str = "push"
     moves_object: bool = True
-    holds_object: bool = False
-    takes_target: bool = False
     returns_home: bool = True
     opening: int = CLOSED
     surrounds_object: bool = False
