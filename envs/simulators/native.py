@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
-from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, check_actions
+from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig, check_actions
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, outcome_of
@@ -31,17 +31,11 @@ from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
 
-class NativeSimulator:
-    """Many worlds, each a `NativeWorld`, stepped by threads; a `Simulator`.
-
-    Each world behaves exactly as a single `NativeWorld`.
-
-    Attributes:
-      engine: the simulator's name in records.
-      world: the present state of all worlds; None before the first `reset` or `load`.
-    """
+class NativeSimulator(Simulator):
+    """Many worlds, each a `NativeWorld`, stepped by threads. Each behaves exactly as a single `NativeWorld`."""
 
     engine = "NativeSimulator"
+    takes_cells = True
 
     def __init__(
         self,
@@ -54,7 +48,6 @@ class NativeSimulator:
         threads: number of worlds that are simulated at the same time; one for each core if None.
         config, shelf, camera: of every world.
         """
-        self.world: World | None = None
         self._config, self._shelf, self._camera = config, shelf, camera
         self._threads = threads or cores()
         self._worlds: list[NativeWorld] = []
@@ -66,76 +59,44 @@ class NativeSimulator:
         return [world.trace for world in self._worlds]
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
-        """Start episodes, one world for each scenario; see `Simulator.reset`.
-
-        Raises:
-          InputError: there are no scenarios, or more objects in one than slots.
-        """
         if not scenarios:
             raise InputError("NativeSimulator: no scenarios are given; reset it with one for each world")
         self._make(len(scenarios))
         return self.replace(dict(enumerate(scenarios)))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in the given worlds; see `Simulator.replace`.
-
-        Raises:
-          InputError: it was not reset before, or there are more objects in a scenario than slots.
-        """
-        self._check_reset()
+        if not self._worlds:
+            raise InputError(f"{self.engine}: reset it before use")
         for i, scenario in scenarios.items():
             self._worlds[i].reset(scenario, self._cells.pop(i, ASSUMED_CELL))
         return self._gather()
 
     def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
-        """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`."""
         self._cells.update(cells)
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Set the state of all worlds, or of those in `only`; see `Simulator.load`.
-
-        Raises:
-          InputError: `only` is given, but the number of worlds differs from the present one.
-        """
         count = len(world.kind)
         if only is None:
             self._make(count)
-        elif len(self._worlds) != count or len(only) != count:
-            raise InputError(
-                f"NativeSimulator: {count} worlds cannot be set in part: there are {len(self._worlds)} now"
-            )
+        else:
+            self._check_part(count, only)
         host = jax.device_get(world)
         for i in range(count) if only is None else np.flatnonzero(only):
             self._worlds[i].load(jax.tree.map(lambda leaf, i=i: leaf[i], host))
         return self._gather()
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Execute an action in every active world; see `Simulator.execute`.
-
-        Raises:
-          InputError: it was not reset before, there are not as many actions as worlds, or a kind is unknown.
-        """
-        self._check_reset()
-        check_actions(self.engine, actions, len(self._worlds))
+        check_actions(self.engine, actions, self._count())
         actions = jax.device_get(actions)
         return self._each(active, lambda i: self._worlds[i].execute(_row(actions, i)))
 
     def programs(self, world: World) -> list[Program]:
-        """The motions of all kinds of action; see `session.preparing.Prepares`."""
+        """The motions of all kinds of action."""
         return motions((self._config or SimulatorConfig()).motion)
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Step every active world until it is at rest; see `Simulator.settle`.
-
-        Raises:
-          InputError: it was not reset before.
-        """
-        self._check_reset()
+        self._count()
         return self._each(active, lambda i: self._worlds[i].settle())
-
-    def _check_reset(self) -> None:
-        if not self._worlds:
-            raise InputError("NativeSimulator: reset it before use")
 
     def _make(self, count: int) -> None:
         """Create or drop worlds so that there are `count`."""
