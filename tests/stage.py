@@ -9,7 +9,7 @@ import numpy as np
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
 from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario

@@ -15,7 +15,7 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, 
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.recording.body_solids import body_points, body_solids
 from mechsearch_jax.envs.simulators.batch_model import ROOM, cells_of, compound_fields, fitting, like_present, room_for
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials import native as trials
 from mechsearch_jax.envs.world import model

@@ -10,8 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.camera import simulated_camera
-from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import compounds_of
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, half_extents, inertial

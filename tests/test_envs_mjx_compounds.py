@@ -21,7 +21,7 @@ from mechsearch_jax.envs.simulators.batch_model import (
     like_present,
 )
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.world import BODIES, TARGET, alike, from_scenario, slots

@@ -17,7 +17,7 @@ from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.pushing import push_models as all_push_models
 from mechsearch_jax.envs.pushing.physics_push import STILL, MjxPhysics, NativePhysics
 from mechsearch_jax.envs.pushing.pushes import push_simulation
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario, superquadrics
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.observation import Observation

@@ -11,8 +11,8 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax.actions.candidates import contact_probability
 from mechsearch_jax.actions.kinds.nothing import no_action
-from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.config.config import Weights

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions.sampler import BLOCK, _gumbel
+from mechsearch_jax.actions.candidates import BLOCK, _gumbel
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.geometry.superquadric import empty, pad

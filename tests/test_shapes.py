@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
 from mechsearch_jax.grasping import graspability

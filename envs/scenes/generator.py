@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose

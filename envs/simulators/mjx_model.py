@@ -98,7 +98,7 @@ class MjxModel:
     """The model that all worlds share, and functions of it.
 
     Attributes:
-      room: the compounds in its slots, see `compound_batch.room_for`; none in a model of plain worlds.
+      room: the compounds in its slots, see `batch_model.room_for`; none in a model of plain worlds.
       blank: the C MuJoCo model with empty slots.
       robot: the robot's configuration at home, shape (9,).
     """

@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from mechsearch_jax.images.cloud import BLOCK, View, above_board, density, shelf_view, thinned_view
+from mechsearch_jax.images.detection import coloured_pixels
 from mechsearch_jax.images.labels import INSTANCES, MISSING
-from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, measured, rays

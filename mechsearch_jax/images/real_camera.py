@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.images.camera_pose import PoseConfig, PoseEstimate, estimate_pose
 from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
+from mechsearch_jax.images.detection import evened
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
-from mechsearch_jax.images.target_pixels import evened
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf

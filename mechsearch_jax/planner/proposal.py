@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions.sampler import sample_action
+from mechsearch_jax.actions.candidates import sample_action
 from mechsearch_jax.actions.types import Sample
 from mechsearch_jax.belief.belief import Belief, possible_space
 from mechsearch_jax.existence import occluders

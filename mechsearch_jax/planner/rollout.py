@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, no_candidates
+from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, contact_probability, no_candidates
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Action, Prediction, Sample
 from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.belief.moved_target import candidate_of
