@@ -28,8 +28,8 @@ from mechsearch_jax.robot.pads import between, grip_between
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import Piece, solids
-from mechsearch_jax.shapes.field import field_of
 from mechsearch_jax.shapes.solid import surface
+from mechsearch_jax.shapes.union import field_of
 from mechsearch_jax.viz.drawing import draw_target, target_points
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics

@@ -12,8 +12,8 @@ from test_workspace_target import BOTTLE, CUP, TEE
 
 from mechsearch_jax.shapes import PRIMITIVES, union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, faces, half_extents, inside, mesh, solids
-from mechsearch_jax.shapes.field import field_of
 from mechsearch_jax.shapes.solid import solid_of, surface
+from mechsearch_jax.shapes.union import field_of
 
 LEANING = (math.cos(0.3), 0.0, math.sin(0.3), 0.0)
 OCTAHEDRON = tuple(tuple(0.03 * s * (i == j) for j in range(3)) for i in range(3) for s in (1.0, -1.0))

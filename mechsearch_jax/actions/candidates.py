@@ -253,9 +253,9 @@ def sample_action(
     draft = drafts[-1]
     for i in reversed(range(len(drafts) - 1)):
         draft = jax.tree.map(lambda a, b, i=i: jnp.where(drawn_kind == i, a, b), drafts[i], draft)
-    executable = any_possible & draft.possible
-    kind = jnp.where(executable, draft.action.kind, ActionKind.NONE).astype(jnp.int32)
-    return Sample(draft.action.replace(kind=kind), draft.wrist, draft.grippers, draft.bodies)
+    executable, sample = draft
+    kind = jnp.where(any_possible & executable, sample.action.kind, ActionKind.NONE).astype(jnp.int32)
+    return sample.replace(action=sample.action.replace(kind=kind))
 
 
 def contact_probability(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.config import ActionSpace
-from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
+from mechsearch_jax.actions.types import Action, Candidates, DrawnCandidate, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.footprints import Footprints
@@ -151,6 +151,6 @@ class SampledKind(Kind):
         possible: PossibleSpace,
         candidates: Candidates,
         drawn: DrawnCandidate,
-    ) -> Draft:
-        """The action of a drawn candidate, whose number may be out of range if it is not `wanted`."""
+    ) -> tuple[Bool[Array, ""], Sample]:
+        """Whether a drawn candidate can be executed, and its action; its number may be out of range if not `wanted`."""
         raise NotImplementedError

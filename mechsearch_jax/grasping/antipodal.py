@@ -20,8 +20,8 @@ from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, swept_cloud
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import Compound
-from mechsearch_jax.shapes.field import Field, field_of
 from mechsearch_jax.shapes.solid import surface
+from mechsearch_jax.shapes.union import Field, field_of
 
 # Angles of joint 7 relative to the usual one [rad].
 WRISTS = tuple(math.radians(30 * step) for step in range(-6, 5))

@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 from mechsearch_jax.robot.gripper import FINGER, Gripper, Primitive, primitives_in_gripper
 from mechsearch_jax.robot.pads import between
 from mechsearch_jax.shapes.compound import Compound
-from mechsearch_jax.shapes.field import Field, field_of
 from mechsearch_jax.shapes.solid import surface
+from mechsearch_jax.shapes.union import Field, field_of
 
 # Directions of the approach over a full turn, and the most closings of a body.
 DIRECTIONS, MOST = 24, 16

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.shapes.compound import Compound
-from mechsearch_jax.shapes.field import Field, field_of
+from mechsearch_jax.shapes.union import Field, field_of
 
 # Half the width of a finger's pad, how far it reaches before and behind the line between the tips [m], and lines across
 # it either way.

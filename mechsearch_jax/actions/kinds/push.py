@@ -24,7 +24,7 @@ from mechsearch_jax.actions.approach import (
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace
 from mechsearch_jax.actions.kind import SampledKind, Sketch
 from mechsearch_jax.actions.kinds.object_grasps import PASSING_GAP
-from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
+from mechsearch_jax.actions.types import Action, Candidates, DrawnCandidate, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT, PushModel
 from mechsearch_jax.geometry.bodies import slimmed
@@ -393,7 +393,9 @@ class Push(SampledKind):
         grippers, of_scene = gripper_clouds(tables).points, (possible, make(scene.rotation, scene.position), clouds)
         return masked_vmap(enters, usable.reshape(-1), grippers, of_scene, rows, block=64).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, scene, possible, candidates, drawn: DrawnCandidate) -> Draft:
+    def draft(
+        self, key, space: ActionSpace, scene, possible, candidates, drawn: DrawnCandidate
+    ) -> tuple[Array, Sample]:
         """The push, and the poses of gripper and object between its ends."""
         _, v, d = candidates.reached.shape
         index, number = drawn.object, jnp.clip(drawn.number, 0, v * d - 1)
@@ -414,7 +416,7 @@ class Push(SampledKind):
         passed = displacement[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
         grippers = translate(jnp.broadcast_to(T, (PLACES, 4, 4)), passed)
         bodies = translate(jnp.broadcast_to(T_object, (PLACES, 4, 4)), passed)
-        return Draft(jnp.array(True), action, wrist, grippers, bodies)
+        return jnp.array(True), Sample(action, wrist, grippers, bodies)
 
     def predict(
         self,
