@@ -14,7 +14,7 @@ from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of
 from mechsearch_jax.shapes import PRIMITIVES, in_order, union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, hull, solids, surface_points
 from mechsearch_jax.shapes.primitives import Primitive
-from mechsearch_jax.viz.raycast import Colour, Solid
+from mechsearch_jax.viz.raycast import Colour, VisibleSolid
 
 if TYPE_CHECKING:
     import trimesh
@@ -56,7 +56,7 @@ def slot_colour(index: int) -> Colour:
     return red, green, blue
 
 
-def body_solids(world: World) -> dict[int, list[Solid]]:
+def body_solids(world: World) -> dict[int, list[VisibleSolid]]:
     """The solids of the bodies that are there, by slot, each in the frame of its body.
 
     Args:
@@ -70,14 +70,14 @@ def body_solids(world: World) -> dict[int, list[Solid]]:
             shown[i] = _of_compound(body.compound, i)
         else:
             shape, half = in_order()[int(world.kind[i])], np.asarray(world.half_size[i])
-            shown[i] = [Solid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))]
+            shown[i] = [VisibleSolid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))]
     return shown
 
 
-def _of_compound(compound: Compound, slot: int) -> list[Solid]:
+def _of_compound(compound: Compound, slot: int) -> list[VisibleSolid]:
     colour = slot_colour(slot) if slot == TARGET else compound.colour or slot_colour(slot)
     return [
-        Solid(_surface(solid), _half(solid), solid.rotation, np.array(solid.position), colour)
+        VisibleSolid(_surface(solid), _half(solid), solid.rotation, np.array(solid.position), colour)
         for solid in solids(compound.pieces)
     ]
 
@@ -91,7 +91,7 @@ def _half(solid: Piece) -> Float[np.ndarray, " 3"]:
     return np.abs(np.array(solid.vertices)).max(axis=0) if solid.shape == CONVEX else np.array(solid.half_size)
 
 
-def moved(solid: Solid, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"]) -> Solid:
+def moved(solid: VisibleSolid, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"]) -> VisibleSolid:
     """A solid in the world, from that in the frame of its body, which has a pose."""
     return dataclasses.replace(solid, rotation=rotation @ solid.rotation, position=rotation @ solid.position + position)
 

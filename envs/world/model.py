@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.robot.arm_config import ARMS
-from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, RobotPart
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINTS
 from mechsearch_jax.shapes import PRIMITIVES, Shape, by_shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, inertial, solids
@@ -175,7 +175,7 @@ def _inertial(body: ElementTree.Element, inertia: tuple) -> None:
     element(body, "inertial", mass=text(mass), pos=text(*centre), fullinertia=text(*full))
 
 
-def _solids(body: ElementTree.Element, solids: Sequence[Primitive]) -> None:
+def _solids(body: ElementTree.Element, solids: Sequence[RobotPart]) -> None:
     for solid in solids:
         turn = Rotation.from_matrix(solid.T_frame_primitive[:3, :3]).as_quat(scalar_first=True)
         # A capsule is drawn in by its radius alone; a box on every side.

@@ -22,7 +22,7 @@ from mechsearch_jax.images.labels import INSTANCES, OTHER
 from mechsearch_jax.images.target_pose import (
     Evidence,
     Placement,
-    Sample,
+    SampledPixels,
     away_from,
     depth_tolerance,
     distance,
@@ -144,7 +144,7 @@ def fitted_pose(
     passes = jnp.sum((nearest * along - middle[None]) ** 2, axis=-1) < reach**2
     beside, _ = draw(jax.random.fold_in(key, 1), passes, BESIDE)
     chosen, tolerance = of_target.reshape(-1), depth_tolerance(depth, of_target)
-    sample = Sample(
+    sample = SampledPixels(
         along[beside], flat[beside], depth.reshape(-1)[beside], chosen[beside], jnp.broadcast_to(tolerance, BESIDE)
     )
     proof = jax.vmap(lambda pose: evidence(target, upright(target, shelf, pose), origin, sample))(poses)
@@ -249,7 +249,7 @@ def detect(
     near = above_board(shelf, image.points, -MARGIN)
     coloured = coloured_pixels(detector, image.colour, image.depth) & near
     tolerance = jnp.broadcast_to(depth_tolerance(image.depth, coloured), coloured.shape)
-    sample = Sample(rays(camera), image.points, image.depth, coloured, tolerance)
+    sample = SampledPixels(rays(camera), image.points, image.depth, coloured, tolerance)
     scene = _Scene(sample, near, jnp.array(camera.position), shelf, threshold)
 
     def goes_on(state):
@@ -272,7 +272,7 @@ def detect(
 class _Scene(flax.struct.PyTreeNode):
     """What is the same at every place: the pixels, which are near the shelf's space, the camera's position, ..."""
 
-    sample: Sample
+    sample: SampledPixels
     near: jax.Array
     origin: jax.Array
     shelf: Shelf
@@ -315,7 +315,7 @@ def _at_place(
     reach = jnp.sum(flat.rays * towards, axis=-1, keepdims=True) / jnp.sum(flat.rays**2, axis=-1, keepdims=True)
     passes = jnp.sum((reach * flat.rays - towards) ** 2, axis=-1) < _diagonal(target) ** 2
     region, _ = draw(compare_key, passes, COMPARED)
-    compared: Sample = jax.tree.map(lambda a: a[region], flat)
+    compared: SampledPixels = jax.tree.map(lambda a: a[region], flat)
 
     def best(placements: Placement) -> tuple[Placement, Evidence]:
         each = jax.vmap(lambda placement: evidence(target, placement, origin, compared))(placements)

@@ -148,7 +148,7 @@ class Placement(flax.struct.PyTreeNode):
     centre: jax.Array
 
 
-class Sample(flax.struct.PyTreeNode):
+class SampledPixels(flax.struct.PyTreeNode):
     """N pixels of an image.
 
     Attributes:
@@ -189,7 +189,7 @@ def away_from(target: Target, placement: Placement, points: Float[Array, "n 3"])
     return target.solid.distance(body[:, :2], body[:, 2], jnp)
 
 
-def evidence(target: Target, placement: Placement, origin: Float[Array, " 3"], sample: Sample) -> Evidence:
+def evidence(target: Target, placement: Placement, origin: Float[Array, " 3"], sample: SampledPixels) -> Evidence:
     """What pixels say for and against a placement.
 
     For it are pixels of the target's colour on its surface. Against it are pixels in its outline that show something

@@ -26,7 +26,7 @@ Colour = tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Solid:
+class VisibleSolid:
     """A visible solid.
 
     Attributes:
@@ -95,7 +95,7 @@ class Eye:
         colour = np.broadcast_to(self._background, (*shape, 3)).copy()
         return Picture(np.full(shape, np.inf, np.float32), colour)
 
-    def picture(self, solids: Iterable[Solid], behind: Picture | None = None) -> Picture:
+    def picture(self, solids: Iterable[VisibleSolid], behind: Picture | None = None) -> Picture:
         """A picture of solids, merged by depth with the picture `behind`."""
         start = behind or self.empty()
         picture = Picture(start.depth.copy(), start.colour.copy())
@@ -104,7 +104,7 @@ class Eye:
             self._draw(solid, picture)
         return picture
 
-    def _draw(self, solid: Solid, picture: Picture) -> None:
+    def _draw(self, solid: VisibleSolid, picture: Picture) -> None:
         window = self._window(solid)
         if window is None:
             return
@@ -126,7 +126,7 @@ class Eye:
         picture.depth[window][nearer] = depth
         picture.colour[window][nearer] = shade[:, None] * np.array(solid.colour, np.float32)
 
-    def _window(self, solid: Solid) -> tuple[slice, slice] | None:
+    def _window(self, solid: VisibleSolid) -> tuple[slice, slice] | None:
         """The part of the image that contains a solid's bounding box; None if that is outside."""
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
         corners = (signs * solid.half_size) @ np.asarray(solid.rotation).T + solid.position
