@@ -17,8 +17,8 @@ from mechsearch_jax.config.presets import standard
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.slots import OneSlot
-from mechsearch_jax.envs.simulators import native_world
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators import native
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls
 from mechsearch_jax.envs.trials.learning import FRICTIONS, Hypothesis, LearningTrials
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -348,8 +348,8 @@ def test_an_arm_that_is_held_up_on_its_way_out_leaves_what_it_has_put_down(monke
     late = np.arange(len(reference.q)) - int(reference.opens)
     wrist = np.eye(7)[6] * ((late > 20) & (late < 30))[:, None]
     commands = controls(reference)
-    monkeypatch.setattr(native_world, "reference_motion", lambda *_: (reference.replace(q=reference.q + wrist), True))
-    monkeypatch.setattr(native_world, "controls", lambda _: commands)
+    monkeypatch.setattr(native, "reference_motion", lambda *_: (reference.replace(q=reference.q + wrist), True))
+    monkeypatch.setattr(native, "controls", lambda _: commands)
     places = []
     for arm_stop in (0.0, 0.5):
         bottle = standing("cylinder", (0.024, 0.024, 0.067), 0.5, 0.1)

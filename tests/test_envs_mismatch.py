@@ -22,9 +22,7 @@ from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, targ
 from mechsearch_jax.envs.episode.many_slots import ManySlots, _look
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.slots import OneSlot
-from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
-from mechsearch_jax.envs.simulators.physics import COARSE_STEP, FINE_STEP, PHYSICS
+from mechsearch_jax.envs.simulators.native import COARSE_STEP, FINE_STEP, PHYSICS, NativeSimulator, NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls, resampled
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
 from mechsearch_jax.envs.world.model import body_geometries

@@ -18,7 +18,7 @@ from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
 from mechsearch_jax.envs.episode.many_slots import ManySlots
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -28,12 +28,12 @@ from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.grasping.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.step import SearchState, decide
 from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, scenes_of
-from mechsearch_jax.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.runtime.errors import InputError
 
 TARGET = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.0)

@@ -31,7 +31,7 @@ from mechsearch_jax.envs.scenes.generator import ScenarioGenerator, draws_from
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import grasp_hits, graspability, pairs
+from mechsearch_jax.grasping.graspability import grasp_hits, graspability, pairs
 from mechsearch_jax.networks.weights import load_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem, step

@@ -15,13 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection
+from mechsearch_jax.images.detection import ColouredDepth, coloured_pixels, detect, no_detection
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.measured import measured_share
-from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
