@@ -14,9 +14,8 @@ from mechsearch_jax.envs.recording.recording import RecordedStep, Recording, emp
 from mechsearch_jax.envs.recording.sampled import sampled
 from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, from_scenario, true_superquadrics
-from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
 from mechsearch_jax.planner.state import Sequences
-from mechsearch_jax.planner.trials import TrialResult
+from mechsearch_jax.planner.trials import TrialResult, TriedActions, nothing_tried
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf

@@ -9,11 +9,12 @@ import numpy as np
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
 from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
+from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.planner import Decision, Sequences
-from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -52,7 +53,7 @@ def stays_put(scene):
     assert np.abs(np.asarray(simulator.world.position - before)).max() < 1.5e-3
 
 
-class Stage:
+class Stage(Simulator):
     """A simulator in which actions do what a test says: for all worlds, or by the scenario that a world began with.
 
     A retrieval that is held up has the target in the hand and outside all the same.

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import retrieval
 from mechsearch_jax.actions import approach
 from mechsearch_jax.actions.config import CLOSED, OPEN, ActionConfig, ActionSpace, action_tables
 from mechsearch_jax.actions.kinds import placement, push
@@ -17,8 +16,9 @@ from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import grasp_tables
+from mechsearch_jax.grasping import retrieval
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import grasp_tables
 from mechsearch_jax.robot.entry import crossing_length
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud

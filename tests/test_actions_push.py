@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.actions import ActionConfig, ActionSpace, action_tables, no_action
-from mechsearch_jax.actions.kinds.push import Push
-from mechsearch_jax.actions.kinds.push_starts import object_pushes, push_starts
+from mechsearch_jax.actions.kinds.push import Push, object_pushes, push_starts
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.robot.gripper import Gripper

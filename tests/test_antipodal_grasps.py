@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from test_workspace_target import BOTTLE, CUP, TEE
 
-from mechsearch_jax import antipodal_grasps as places
-from mechsearch_jax.antipodal_grasps import STEEPEST, WRISTS, antipodal_grasps, spread
-from mechsearch_jax.candidate_pairs import is_grasp
-from mechsearch_jax.compound_grasps import OpenHand, grip_between
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import grasp_tables
+from mechsearch_jax.grasping import antipodal as places
+from mechsearch_jax.grasping.antipodal import STEEPEST, WRISTS, antipodal_grasps, spread
+from mechsearch_jax.grasping.closings import OpenHand
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import grasp_tables, is_grasp
 from mechsearch_jax.robot.gripper import Gripper, primitives_in_gripper
+from mechsearch_jax.robot.pads import grip_between
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.compound import Piece
 from mechsearch_jax.shapes.solid import surface

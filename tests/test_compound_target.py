@@ -15,27 +15,27 @@ import mechsearch_jax as ms
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.belief import with_target
-from mechsearch_jax.compound_grasps import between, grip_between
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import existence_tables
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import grasp_tables
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import grasp_tables
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.robot.gripper import Gripper, primitives_in_gripper
+from mechsearch_jax.robot.pads import between, grip_between
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import Piece, solids
-from mechsearch_jax.shapes.field import field_of
 from mechsearch_jax.shapes.solid import surface
+from mechsearch_jax.shapes.union import field_of
 from mechsearch_jax.viz.drawing import draw_target, target_points
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.swept_target import swept_target
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import swept_target
 
 TARGETS = {name: Target.from_parts(pieces) for name, pieces in (("bottle", BOTTLE), ("cup", CUP), ("tee", TEE))}
 CAMERA, SHELF = Camera(), Shelf()

@@ -9,7 +9,7 @@ import pytest
 
 from mechsearch_jax import actions, planner
 from mechsearch_jax.actions import SAMPLED_KINDS, ActionConfig, ActionKind
-from mechsearch_jax.actions.sampler import _shares
+from mechsearch_jax.actions.candidates import _shares
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.dynamics import quasi_static, rigid
 from mechsearch_jax.geometry import footprints, superquadric, transforms

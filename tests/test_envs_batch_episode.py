@@ -18,7 +18,7 @@ from mechsearch_jax.envs.episode.policy_numbers import compile_key
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.simulators.simulator import Flowing, Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Overflow
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner import search_for_grasp
@@ -170,7 +170,7 @@ def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
     assert ("plan", 1) in stages
 
 
-class FlowingStage(Stage):
+class FlowingStage(Stage, Flowing):
     """The same, in which actions take their time: that of the last slot is over first, one after the other."""
 
     def __init__(self, *settings):

@@ -1,6 +1,5 @@
 """A target that is a compound in the world: its files, arrays and image, how it rests, in trials and in the batch."""
 
-import dataclasses
 import json
 import math
 
@@ -15,9 +14,8 @@ from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe, target
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, sight_of
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.recording.body_solids import body_points, body_solids
-from mechsearch_jax.envs.simulators.batch_model import cells_of
-from mechsearch_jax.envs.simulators.compound_batch import ROOM, compound_fields, fitting, like_present, room_for
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.batch_model import ROOM, cells_of, compound_fields, fitting, like_present, room_for
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials import native as trials
 from mechsearch_jax.envs.world import model
@@ -25,9 +23,6 @@ from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.world import (
     BODIES,
     TARGET,
-    CompoundWorld,
-    TargetCompoundWorld,
-    World,
     bodies_of,
     fallen_over,
     from_scenario,
@@ -43,8 +38,7 @@ from mechsearch_jax.workspace import scenario as scenarios
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
-from mechsearch_jax.workspace.target_file import load_target
+from mechsearch_jax.workspace.target import Target, load_target
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 SHELF = Shelf()
@@ -86,12 +80,14 @@ def test_a_scenario_with_a_compound_target_is_written_and_read(tmp_path, target)
     assert hash(target_of(again, Target())) == hash(target)
 
 
-def test_only_a_world_whose_target_is_a_compound_is_one_of_those():
+def test_only_a_world_whose_target_is_a_compound_knows_one():
     cylinder = Body("cylinder", (0.02, 0.02, 0.05), (0.7, 0.0, 0.4545), UPRIGHT)
-    assert type(from_scenario(Scenario("plain", (BOX,), cylinder))) is World
-    assert type(from_scenario(Scenario("things", (standing(MUG),), cylinder))) is CompoundWorld
+    plain, things = Scenario("plain", (BOX,), cylinder), Scenario("things", (standing(MUG),), cylinder)
+    assert from_scenario(plain).compounds is from_scenario(plain).target is from_scenario(things).target is None
+    assert from_scenario(things).compounds is not None
     world = from_scenario(hidden(MUG, BOX))
-    assert type(world) is TargetCompoundWorld
+    assert world.compounds is not None
+    assert world.target is not None
     assert bodies_of(world)[TARGET].compound == MUG.compound
     assert bodies_of(world)[0].shape == "box"
 
@@ -99,7 +95,7 @@ def test_only_a_world_whose_target_is_a_compound_is_one_of_those():
 def test_a_plain_world_gets_the_targets_pieces():
     scene = hidden(MUG, BOX, yaw=0.5)
     world = from_scenario(scene)
-    plain = World(*(getattr(world, field.name) for field in dataclasses.fields(World)))
+    plain = world.replace(compounds=None, target=None)
     again = with_target(plain, MUG)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(world), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)

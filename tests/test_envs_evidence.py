@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from recordings import EPISODE, LOST, OBJECTS, PUSH, RECORDING, SEQUENCES, SLOTS, stacked
 
-from mechsearch_jax.actions import no_action
 from mechsearch_jax.envs.episode.numbering import named_tried
 from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets, objects_in_words
 from mechsearch_jax.envs.recording.evidence import Forecasts, foreseen_rows
 from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
 from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Decision, initial_belief
-from mechsearch_jax.planner.noted_trials import NotedTrials
-from mechsearch_jax.planner.trials import TrialResult, decide, sequences_to_try
+from mechsearch_jax.planner import Decision
+from mechsearch_jax.planner.state import Alternatives
+from mechsearch_jax.planner.step import decide, unsearched
+from mechsearch_jax.planner.trials import TrialResult, nothing_tried, sequences_to_try, tried
 from mechsearch_jax.runtime.errors import InputError
 
 
@@ -120,49 +120,43 @@ def test_least_sets_of_what_grasps_hit():
     assert blocking(np.zeros((1, 5), bool)) == ()
 
 
-def test_trials_are_noted_up_to_the_first_success_with_the_bodies_numbers():
+def test_trials_are_kept_up_to_the_first_success_with_the_bodies_numbers():
     codes = [TrialResult.HARMFUL, TrialResult.UNKNOWN, TrialResult.SUCCEEDED, TrialResult.FAILED]
-    noted = NotedTrials(lambda problem, scenes, actions, wanted: np.array([codes], np.int32))
-    push = jax.tree.map(jnp.asarray, PUSH.replace(object=np.int32(1)))
-    actions = jax.tree.map(lambda a: jnp.stack([a] * 4)[None], push)
+    actions = jax.tree.map(lambda a: np.stack([a] * 4)[None], PUSH.replace(object=np.int32(1)))
     bodies = np.array([3, 5, *range(6)])[:SLOTS]
-    assert len(noted.tried().result) == 0
-    call = NotedTrials.__call__.__wrapped__
-    results = call(noted, None, None, actions, np.array([[True, False, True, True]]))
-    np.testing.assert_array_equal(results, [codes])
-    tried = named_tried(noted.tried(), bodies)
-    assert tried.result.tolist() == [TrialResult.HARMFUL, TrialResult.SUCCEEDED]
-    assert tried.action.object.tolist() == [5, 5]
-    call(noted, None, None, actions, np.array([[True, True, False, False]]))
-    assert len(noted.tried().result) == 4
-    assert tried.action.kind.tolist() == [int(PUSH.kind)] * 2
-    assert int(no_action().kind) not in tried.action.kind.tolist()
+
+    def kept(*worth):
+        alternatives = Alternatives(actions, np.array([worth]), np.zeros((1, 4), np.int32), None, None)
+        return named_tried(tried(alternatives, np.array([codes], np.int32)), bodies)
+
+    found = kept(True, False, True, True)
+    assert found.result.tolist() == [TrialResult.HARMFUL, TrialResult.SUCCEEDED]
+    assert found.action.object.tolist() == [5, 5]
+    assert found.action.kind.tolist() == [int(PUSH.kind)] * 2
+    assert kept(True, True, False, False).result.tolist() == [TrialResult.HARMFUL, TrialResult.UNKNOWN]
+    assert len(nothing_tried().result) == 0
 
 
-def test_decisions_are_the_same_with_trials_that_are_noted(problem):
-    codes = np.array([[TrialResult.HARMFUL, TrialResult.FAILED, TrialResult.UNKNOWN]], np.int32)
-    objects = jax.tree.map(jnp.asarray, OBJECTS)
-    sequences = jax.tree.map(jnp.asarray, SEQUENCES)
-    first = jax.tree.map(lambda a: a[0, 0], sequences.actions)
-    alternatives = sequences_to_try(sequences, objects, jnp.float32(0.0))
+def test_a_decision_comes_with_what_was_tried_before_it(problem):
+    objects, sequences = (jax.tree.map(jnp.asarray, tree) for tree in (OBJECTS, SEQUENCES))
     decision = Decision(
-        first,
+        jax.tree.map(lambda a: a[0, 0], sequences.actions),
         sequences.value[0],
         jnp.float32(100.0),
         sequences.cost[0, 0],
         objects,
         sequences,
-        alternatives=alternatives,
+        alternatives=sequences_to_try(sequences, objects, jnp.float32(0.0)),
     )
-    observation = Observation(objects, jnp.array(False), jnp.zeros(3))
-    for row in (codes, codes[:, ::-1], np.full_like(codes, TrialResult.SUCCEEDED)):
+    state = unsearched(problem, Observation(objects, jnp.array(False), jnp.zeros(3)))
+    worth = np.flatnonzero(decision.alternatives.worth)
+    for succeeds in range(len(worth)):
 
-        def trials(problem, scenes, actions, wanted, row=row):
-            return row
+        def trials(problem, scenes, actions, wanted, succeeds=succeeds):
+            row = np.arange(wanted.shape[1]) >= worth[succeeds]
+            return np.where(row, TrialResult.SUCCEEDED, TrialResult.HARMFUL)[None].astype(np.int32)
 
-        noted = NotedTrials(trials)
-        arguments = (jax.random.key(0), problem, initial_belief(problem), observation)
-        plainly, noting = (decide(lambda *_: decision, each, *arguments) for each in (trials, noted))
-        jax.tree.map(np.testing.assert_array_equal, plainly, noting)
-        assert len(noted.tried().result)
-    assert int(plainly.refused) == 0
+        decided = decide(lambda *_: decision, trials, jax.random.key(0), problem, state)
+        assert decided.tried.result.tolist() == [TrialResult.HARMFUL] * succeeds + [TrialResult.SUCCEEDED]
+        made = jax.tree.map(lambda a: a[-1], decided.tried.action)
+        jax.tree.map(np.testing.assert_array_equal, decided.decision.action, made)

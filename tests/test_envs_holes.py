@@ -11,7 +11,7 @@ from scipy import ndimage
 from stage import HIDDEN, OPEN, TWO, grab
 
 from mechsearch_jax.envs.camera.holes import BASELINE, HOLES, JUMP, NARROWEST, WIDEST, DrawnHoles, Holes, shadows
-from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
+from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.sensing import sensed_depth, sensing_of
 from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
@@ -24,6 +24,7 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.mismatch import ASSUMED, HolesName, Mismatch
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import thinned_view
+from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.camera import Camera
@@ -195,14 +196,15 @@ def test_a_target_without_depth_is_not_seen(name, visible):
 
 def test_masks_have_no_points_in_holes():
     masks, view, world = recogniser("masks", target_of(OPEN)), thinned_view(CAMERA, SHELF), from_scenario(OPEN)
-    holes = sensed("target", OPEN)
-    image = labelled(jax.random.key(0), masks, view, SHELF, world, jnp.array(True), holes)
+    images = masks.images(jax.random.key(0), Snapshot(CAMERA, SHELF, world, sensing=sensed("target", OPEN)))
+    image, visible, _ = labelled(masks.core, jax.random.key(0), CAMERA, view, SHELF, images)
     there = np.asarray(observe(view.camera, world, SHELF).segmentation) == TARGET
     assert there.sum() > 100
     assert np.isnan(np.asarray(image.points)[there]).all()
     assert np.isnan(np.asarray(image.depth)[there]).all()
     assert np.isfinite(np.asarray(image.points)[~there]).any()
     assert not np.asarray(image.of_target).any()
+    assert not visible
 
 
 @pytest.mark.slow
@@ -238,11 +240,11 @@ def test_slots_see_their_own_holes(problem):
     slots.sense_by(dict(enumerate(sensings)))
     keys = jax.random.split(jax.random.key(0), 4)
     together = slots.look(worlds, keys, range(4))
-    valid = np.asarray(slots._state.observation.objects.valid)
+    valid = np.asarray(slots._state.search.observation.objects.valid)
     assert len({tuple(row) for row in valid}) > 1
     for row, sensing in enumerate(sensings):
         one = OneSlot(problem, Method().policy(), oracle)
         one.sense_by({0: sensing})
         alone = one.look(jax.tree.map(lambda a: a[:1], worlds), keys[row : row + 1], [0])
-        np.testing.assert_array_equal(valid[row], one.observation.objects.valid)
+        np.testing.assert_array_equal(valid[row], one.state.observation.objects.valid)
         assert (alone.size[0], alone.truth[0]) == (together.size[row], together.truth[row])

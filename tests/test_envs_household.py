@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.scenes.household import body_at, draw_thing, household, standing_height, thing_of
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.compound import half_extents, inertial, solids, surface_points
 from mechsearch_jax.shapes.parts import PARTS, parts_of, volume_in_common

@@ -17,13 +17,14 @@ from mechsearch_jax.envs.known_target import search as known_search
 from mechsearch_jax.envs.known_target.judgement import InFullView, Judgement, judge
 from mechsearch_jax.envs.known_target.search import Frontier, KnownSearchConfig, Node, in_turn
 from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, best_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Sequences
 from mechsearch_jax.planner.rollout import present_state
-from mechsearch_jax.retrieval import GraspChoice, best_grasp, best_grasps
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -32,7 +33,7 @@ SEARCH = planner.planning_policy(objective=InFullView())
 
 
 @dataclasses.dataclass
-class Toy:
+class Toy(Simulator):
     """A simulator in which a push moves its object by its displacement, and a retrieval comes to what a test says.
 
     Attributes:

@@ -17,8 +17,8 @@ from mechsearch_jax.config.presets import standard
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.slots import OneSlot
-from mechsearch_jax.envs.simulators import native_world
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators import native
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls
 from mechsearch_jax.envs.trials.learning import FRICTIONS, Hypothesis, LearningTrials
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -28,6 +28,7 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import initial_belief, search_for_grasp
 from mechsearch_jax.planner.learning import LEAST, LearnedFriction, LearnsFriction, posterior, restored
+from mechsearch_jax.planner.step import SearchState, unsearched
 from mechsearch_jax.planner.trials import TrialResult, scenes_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import Searcher
@@ -66,7 +67,7 @@ def pushed(problem, friction):
 def test_a_push_tells_the_friction(problem, friction):
     before, after = pushed(problem, friction)
     learned = LearnedFriction(LearningTrials(NativeTrials(threads=1)), 1)
-    learned.learn_first(problem, initial_belief(problem), before, PUSH, after)
+    learned.learn_first(problem, SearchState(initial_belief(problem), before, PUSH), after)
     best = FRICTIONS[int(learned.probabilities[0].argmax())]
     assert (best.friction > 1.0) == (friction > 1.0)
     assert learned.probabilities[0].sum() == pytest.approx(1.0)
@@ -95,7 +96,7 @@ def test_trials_assume_what_is_most_probable(problem):
 def test_nothing_is_learned_where_nothing_was_done(problem):
     before, after = pushed(problem, 2.0)
     learned = LearnedFriction(LearningTrials(), 1)
-    learned.learn_first(problem, initial_belief(problem), before, no_action(), after)
+    learned.learn_first(problem, unsearched(problem, before), after)
     assert learned.probabilities[0] == pytest.approx(LearningTrials().prior)
 
 
@@ -103,7 +104,7 @@ def test_what_cannot_be_simulated_teaches_nothing(problem):
     before, after = pushed(problem, 2.0)
     learned = LearnedFriction(LearningTrials(NativeTrials(threads=1)), 1)
     out_of_reach = PUSH.replace(T_world_gripper=pose(3.0, 0.0, 0.1))
-    learned.learn_first(problem, initial_belief(problem), before, out_of_reach, after)
+    learned.learn_first(problem, SearchState(initial_belief(problem), before, out_of_reach), after)
     assert learned.probabilities[0] == pytest.approx(LearningTrials().prior)
 
 
@@ -187,7 +188,7 @@ def test_slots_learn_between_looks_and_forget(problem):
     simulator.execute(PUSH)
     keys = jax.random.split(jax.random.key(0), 1)
     slot.look(before, keys, [0])
-    slot.action = PUSH
+    slot.state = slot.state.replace(action=PUSH)
     slot.look(jax.tree.map(lambda a: a[None], simulator.world), keys, [0])
     assert slot._learned.probabilities[0].argmax() > 2
     slot.forget(np.array([True]))
@@ -228,18 +229,19 @@ def test_each_of_many_slots_learns_from_its_own_action_and_assumes_what_it_learn
     rows = [(EDGES, False), (FIRM, False), (LOOSE, False)]
     spy = Spy()
     slots, keys = slots_of(problem, proposes(over, aside), spy, rows)
-    known = slots._state.belief
+    known = slots._state.search.belief
     world = stack(*(from_scenario(begin(objects)) for objects, _ in rows))
     slots.look(world, keys, [0, 1, 2])
     done = [
         over.replace(object=jnp.int32(1)),
-        jax.tree.map(lambda a: a[1], slots._state.action),
+        jax.tree.map(lambda a: a[1], slots._state.search.action),
         over.replace(object=jnp.int32(2)),
     ]
-    slots._state = slots._state.replace(action=jax.tree.map(lambda *a: jnp.stack(a), *done))
+    search = slots._state.search
+    slots._state = slots._state.replace(search=search.replace(action=jax.tree.map(lambda *a: jnp.stack(a), *done)))
     slots.look(world, keys, [2, 0, 1])
     assert spy.acts == {0.1: 1, -0.075: 0, -0.09: 2}
-    slots._state = slots._state.replace(belief=known)
+    slots._state = slots._state.replace(search=slots._state.search.replace(belief=known))
     slots.decide(keys, [2, 0, 1])
     expected = {name: FRICTIONS[index].friction for name, index in LEARNED.items()}
     assert spy.frictions == pytest.approx(expected)
@@ -295,7 +297,7 @@ def test_what_was_learned_goes_on(problem, tmp_path):
     saver._state = dataclasses.replace(beginning(problem), hypothesis_probabilities=learned)
     saver.save(tmp_path / "search.npz")
     loader.load(tmp_path / "search.npz")
-    assert loader._learned(loader._now.observation).first == learned
+    assert loader._learned(unsearched(problem, loader._now.observation), loader._now.observation).first == learned
 
 
 @pytest.mark.parametrize("ok", [True, False])
@@ -305,7 +307,8 @@ def test_a_searcher_learns_from_actions_that_were_executed_to_their_end(problem,
     searcher.problem = problem
     searcher._state = dataclasses.replace(beginning(problem), observation=before, action=PUSH, handed=True)
     searcher.acted(ok=ok)
-    probabilities = searcher._learned(after).probabilities[0]
+    state = SearchState(searcher._now.belief, before, PUSH)
+    probabilities = searcher._learned(state, after).probabilities[0]
     assert (probabilities == pytest.approx(LearningTrials().prior)) == (not ok)
 
 
@@ -345,8 +348,8 @@ def test_an_arm_that_is_held_up_on_its_way_out_leaves_what_it_has_put_down(monke
     late = np.arange(len(reference.q)) - int(reference.opens)
     wrist = np.eye(7)[6] * ((late > 20) & (late < 30))[:, None]
     commands = controls(reference)
-    monkeypatch.setattr(native_world, "reference_motion", lambda *_: (reference.replace(q=reference.q + wrist), True))
-    monkeypatch.setattr(native_world, "controls", lambda _: commands)
+    monkeypatch.setattr(native, "reference_motion", lambda *_: (reference.replace(q=reference.q + wrist), True))
+    monkeypatch.setattr(native, "controls", lambda _: commands)
     places = []
     for arm_stop in (0.0, 0.5):
         bottle = standing("cylinder", (0.024, 0.024, 0.067), 0.5, 0.1)

@@ -14,9 +14,7 @@ from mechsearch_jax.envs.recording.evidence import evidence_without_truth
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision
-from mechsearch_jax.planner.noted_trials import nothing_tried
-from mechsearch_jax.planner.trials import TrialResult, sequences_to_try
-from mechsearch_jax.session import searcher as searchers
+from mechsearch_jax.planner.trials import TrialResult, nothing_tried, sequences_to_try
 
 
 @pytest.fixture
@@ -75,14 +73,6 @@ def test_decisions_are_the_same_with_a_view_and_it_is_shown_each(problem):
     ((step, tried),) = noting.shown
     assert step is steps[1]
     assert tried.result.tolist() == [TrialResult.HARMFUL, TrialResult.SUCCEEDED]
-
-
-def test_without_a_view_nothing_is_noted(problem, monkeypatch):
-    def noted(trials):
-        pytest.fail("trials are noted for nobody")
-
-    monkeypatch.setattr(searchers, "NotedTrials", noted)
-    searcher_of(problem, BOX, policy=comparing, rehearsal=refusing).next(IMAGES.depth)
 
 
 def test_the_page_shows_what_was_recognised_and_what_is_planned(problem, view):

@@ -12,7 +12,7 @@ from mechsearch_jax.config.fixed import AS_IN_PAPER, FIXED
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
-from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import DECISION_VERSION

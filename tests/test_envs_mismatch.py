@@ -13,7 +13,7 @@ from stage import HIDDEN, OPEN, Stage, grab
 
 from mechsearch_jax.actions import KINDS, ActionKind
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key, sensed_colour
-from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
+from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.sensing import OtherNoise, Sensing, resized, sensing_of, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
@@ -22,9 +22,7 @@ from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, targ
 from mechsearch_jax.envs.episode.many_slots import ManySlots, _look
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.slots import OneSlot
-from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
-from mechsearch_jax.envs.simulators.physics import COARSE_STEP, FINE_STEP, PHYSICS
+from mechsearch_jax.envs.simulators.native import COARSE_STEP, FINE_STEP, PHYSICS, NativeSimulator, NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls, resampled
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
 from mechsearch_jax.envs.world.model import body_geometries
@@ -32,6 +30,7 @@ from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.noise import no_noise
+from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import in_order
@@ -224,7 +223,7 @@ def test_a_lying_box_and_a_body_of_parts_stay_on_the_board():
 def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
     masks = dataclasses.replace(recogniser("masks", target_of(SCENE)), noise=no_noise)
     shot, key = snapshot(mismatch), jax.random.key(0)
-    image = labelled(key, masks, shelf_view(CAMERA, SHELF), SHELF, shot.world, jnp.array(False), shot.sensing)
+    image, _, _ = labelled(masks.core, key, CAMERA, shot.view, SHELF, masks.images(key, shot))
     points, labels = np.asarray(image.points), np.asarray(image.labels)
     seen, there = oracle(jax.random.key(0), shot).objects, snapshot().world
     for slot in np.flatnonzero(seen.valid):
@@ -260,20 +259,19 @@ def test_a_camera_that_is_shifted_shifts_recognised_poses():
 
 
 def test_depth_noise_and_missing_depth_are_as_given():
-    masks, view = recogniser("masks", target_of(SCENE)), shelf_view(CAMERA, SHELF)
-    key = jax.random.key(0)
+    masks = recogniser("masks", target_of(SCENE))
 
-    def points(mismatch):
-        shot = snapshot(mismatch)
-        return np.asarray(labelled(key, masks, view, SHELF, shot.world, jnp.array(False), shot.sensing).points)
+    def depth(mismatch):
+        return np.asarray(masks.images(jax.random.key(0), snapshot(mismatch)).depth)
 
-    usual, exact, noisy = points(ASSUMED), points(Mismatch(depth_noise=0.0)), points(Mismatch(depth_noise=0.005))
-    lost = points(Mismatch(missing_depth=0.2))
-    there = np.isfinite(exact).all(axis=-1)
+    usual, exact, noisy = depth(ASSUMED), depth(Mismatch(depth_noise=0.0)), depth(Mismatch(depth_noise=0.005))
+    lost = depth(Mismatch(missing_depth=0.2))
+    there = np.isfinite(exact)
     for measured, deviation in ((usual, 0.001), (noisy, 0.005)):
-        distance = np.linalg.norm((measured - exact)[there], axis=-1)
-        assert np.sqrt(np.mean(distance**2)) == pytest.approx(deviation, rel=0.03)
-    missing = ~np.isfinite(lost).all(axis=-1)
+        # Of a distance in a random direction, a third of the variance is along the camera's axis.
+        error = measured[there] - exact[there]
+        assert np.sqrt(np.mean(error**2)) == pytest.approx(deviation / np.sqrt(3), rel=0.03)
+    missing = ~np.isfinite(lost)
     assert missing[there].mean() == pytest.approx(0.2, abs=0.01)
     # The other pixels measure what they do without.
     np.testing.assert_allclose(lost[there & ~missing], usual[there & ~missing], atol=1e-6)
@@ -282,7 +280,7 @@ def test_depth_noise_and_missing_depth_are_as_given():
 def test_exposure_and_noise_of_colour_are_as_given():
     full, view = recogniser("full", target_of(SCENE)), shelf_view(CAMERA, SHELF)
     world = from_scenario(SCENE)
-    appearance = drawn_appearance(scene_key(world), full.detector.rgb, 40.0)
+    appearance = drawn_appearance(scene_key(world), full.target_colour, 40.0)
     plain = observe(view.camera, world, SHELF, appearance).colour
     for mismatch in (Mismatch(exposure=0.5), Mismatch(exposure=1.5, color_noise=8 / 255, white_balance=0.1)):
         seen = np.asarray(sensed_colour(jax.random.key(1), plain, sensed(mismatch).colour))
@@ -464,7 +462,7 @@ def seen_in(slots, problem, world, mismatches):
     """The poses that slots see at once, of a mismatch each."""
     slots.sense_by({row: Start(SCENE, 0, mismatch=m).sensing(problem) for row, m in enumerate(mismatches)})
     summary = slots.look(world, jax.random.split(jax.random.key(0), len(mismatches)), range(len(mismatches)))
-    return slots._state.observation.objects.position, summary
+    return slots._state.search.observation.objects.position, summary
 
 
 @pytest.mark.slow
@@ -477,7 +475,7 @@ def test_every_slot_senses_by_itself_and_numbers_compile_nothing(problem):
         one = OneSlot(problem, Method().policy(), oracle)
         one.sense_by({0: Start(SCENE, 0, mismatch=mismatch).sensing(problem)})
         alone = one.look(jax.tree.map(lambda a: a[:1], world), jax.random.split(jax.random.key(0), 1), [0])
-        np.testing.assert_allclose(many[row], one.observation.objects.position, atol=1e-6)
+        np.testing.assert_allclose(many[row], one.state.observation.objects.position, atol=1e-6)
         assert (alone.size[0], alone.truth[0]) == (summary.size[row], summary.truth[row])
     compiled = _look.jitted._cache_size()
     other, _ = seen_in(slots, problem, world, [Mismatch(camera_turn=1.0)] * 2)

@@ -11,13 +11,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.scenes.household import body_at, household, standing_height
-from mechsearch_jax.envs.simulators.batch_model import cells_of
-from mechsearch_jax.envs.simulators.compound_batch import ROOM, ROWS, check_room, compound_fields, fitting, like_present
+from mechsearch_jax.envs.simulators.batch_model import (
+    ROOM,
+    ROWS,
+    cells_of,
+    check_room,
+    compound_fields,
+    fitting,
+    like_present,
+)
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, alike, from_scenario, slots
+from mechsearch_jax.envs.world.world import BODIES, TARGET, alike, from_scenario, slots
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, half_extents
@@ -167,29 +174,29 @@ def _rows_at_rest(compiled, scene):
 
 def test_every_household_thing_has_room():
     for name, thing in household().items():
-        check_room(stack([Scenario(name, standing(name), TARGET_BODY)]))
+        check_room(stack([Scenario(name, standing(name), TARGET_BODY)]).compounds)
         assert thing.name == name
 
 
 def test_what_has_no_room_is_one_line():
     with pytest.raises(InputError, match="meshes and convex polyhedra cannot be simulated here"):
-        check_room(stack([Scenario("mesh", (polyhedron(),), TARGET_BODY)]))
+        check_room(stack([Scenario("mesh", (polyhedron(),), TARGET_BODY)]).compounds)
     pieces = tuple(Piece("ellipsoid", (0.02, 0.02, 0.02), (0.04 * i, 0.0, 0.0)) for i in range(3))
     compound, _ = centred(Compound(pieces, 500.0, 0.5))
     three = Body("compound", half_extents(compound), (0.6, 0.1, 0.45), UPRIGHT, compound)
     with pytest.raises(InputError, match="3 solids of kind ellipsoid, more than 2; use the NativeSimulator"):
-        check_room(stack([Scenario("three", (three,), TARGET_BODY)]))
+        check_room(stack([Scenario("three", (three,), TARGET_BODY)]).compounds)
 
 
 def test_plain_worlds_fit_where_there_is_room_for_compounds():
     plain = stack([PLAIN])
     assert fitting(plain, {}) is plain
     wide = fitting(plain, ROOM)
-    assert isinstance(wide, CompoundWorld)
+    assert wide.compounds is not None
     assert wide.compounds.solids.valid.sum(axis=-1).tolist() == [[1, *[0] * (BODIES - 2), 1]]
     with pytest.raises(InputError, match="compounds among plain worlds; run them one set after the other"):
         fitting(stack([THINGS]), {})
-    assert isinstance(like_present(stack([THINGS]), PLAIN), CompoundWorld)
+    assert like_present(stack([THINGS]), PLAIN).compounds is not None
     with pytest.raises(InputError, match="things has compounds, the scenes before it have none"):
         like_present(plain, THINGS)
 

@@ -20,7 +20,7 @@ from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
 from mechsearch_jax.envs.simulators import mjx_step, simulator, warp_kernels
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import model
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, Mismatch, TrueCell

@@ -35,8 +35,7 @@ from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.envs.recording.step_pictures import Painter
 from mechsearch_jax.envs.recording.step_values import ending, last_world, step_values
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.planner.noted_trials import TriedActions
-from mechsearch_jax.planner.trials import TrialResult
+from mechsearch_jax.planner.trials import TrialResult, TriedActions
 from mechsearch_jax.runtime.errors import InputError
 
 VOID = {"img", "meta", "link", "br"}

@@ -17,14 +17,13 @@ from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.pushing import push_models as all_push_models
 from mechsearch_jax.envs.pushing.physics_push import STILL, MjxPhysics, NativePhysics
 from mechsearch_jax.envs.pushing.pushes import push_simulation
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario, superquadrics
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, PlannerConfig, initial_belief, prediction, search_for_grasp, update_belief
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes.box import CODE as BOX
-from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
+from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()

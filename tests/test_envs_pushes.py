@@ -25,8 +25,7 @@ from mechsearch_jax.networks.push_contacts import reach
 from mechsearch_jax.networks.push_geometry import NORMALS, push_start
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes.box import CODE as BOX
-from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
+from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask

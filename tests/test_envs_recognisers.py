@@ -2,6 +2,7 @@
 
 import colorsys
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import pytest
 from mechsearch_jax.benchmarks.lab.parts.segmentation import numbered
 from mechsearch_jax.envs.camera import recognisers
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
-from mechsearch_jax.envs.camera.recognisers import detected, large_segments, recogniser, true_labels
+from mechsearch_jax.envs.camera.recognisers import recogniser, true_labels
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle
 from mechsearch_jax.envs.episode.episodes import target_of
@@ -19,6 +20,7 @@ from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superqua
 from mechsearch_jax.images.cloud import shelf_view, thinned_view
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import measured_depth
+from mechsearch_jax.perception.recogniser import Recogniser, labelled, large_segments
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
@@ -125,25 +127,20 @@ def test_what_may_be_the_target_is_no_segment():
     np.testing.assert_array_equal(large_segments(jnp.asarray(labels), 0.0), labels)
 
 
-@dataclasses.dataclass
-class Curious:
+def curious_segments(key, shelf, points, of_target):
     """A segmenter that takes the target's pixels for the ninth instance, and all else for the shelf."""
-
-    def __call__(self, key, shelf, points, of_target):
-        return jnp.where(of_target, 8, FREE).astype(jnp.int8)
-
-    __hash__ = object.__hash__
+    return jnp.where(of_target, 8, FREE).astype(jnp.int8)
 
 
 @pytest.fixture(scope="module")
 def shown():
     """What `full` sees of a world, but for its segments, and what the pixels truly show."""
-    curious = dataclasses.replace(recogniser("full", target_of(SCENE)), segmenter=Curious())
-    view = thinned_view(CAMERA, SHELF)
+    full, view, key = recogniser("full", target_of(SCENE)), thinned_view(CAMERA, SHELF), jax.random.key(0)
+    curious = full.core.replace(segmenter=jax.tree_util.Partial(curious_segments))
 
     def see(world):
-        keys = jax.random.split(jax.random.key(0))
-        image, seen = detected(keys, curious, view, SHELF, world, found_pixels(CAMERA) / view.stride**2)
+        images = full.images(key, Snapshot(CAMERA, SHELF, world))
+        image, seen, _ = labelled(curious, key, CAMERA, view, SHELF, images)
         owner = np.asarray(observe(view.camera, world, SHELF).segmentation)
         return jax.tree.map(np.asarray, image), owner, bool(seen)
 
@@ -174,43 +171,54 @@ def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(wor
     assert np.isfinite(image.depth[~nothing]).all()
 
 
-def test_full_reads_nothing_of_the_truth(world):
+@pytest.mark.parametrize("name", ["masks", "full"])
+def test_what_sees_images_reads_nothing_else_of_the_truth(world, name):
     """A snapshot that refuses to give the truth does not differ."""
 
     class Blind(Snapshot):
         @property
         def target_seen(self):
-            raise AssertionError("full read whether the target is in sight")
+            raise AssertionError("read whether the target is in sight")
 
         @property
         def target_pose(self):
-            raise AssertionError("full read where the target is")
+            raise AssertionError("read where the target is")
 
-    full, masks = recogniser("full", target_of(SCENE)), recogniser("masks", target_of(SCENE))
-    jax.eval_shape(lambda here: full(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
-    with pytest.raises(AssertionError, match="in sight"):
-        jax.eval_shape(lambda here: masks(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
+    eyes = recogniser(name, target_of(SCENE))
+    jax.eval_shape(lambda here: eyes(jax.random.key(0), Blind(CAMERA, SHELF, here)), world)
 
 
-@pytest.mark.slow
-def test_full_sees_the_same_whatever_the_true_segments_are(world, monkeypatch):
+def test_images_of_full_are_the_same_whatever_the_true_segments_are(world, monkeypatch):
     def scrambled(*arguments):
         image = observe(*arguments)
         return image.replace(segmentation=jnp.zeros_like(image.segmentation) + 3)
 
-    view, keys = thinned_view(CAMERA, SHELF), jax.random.split(jax.random.key(0))
-    plain = moved(world, TARGET, [SCENE.target.position[0], -0.06, SCENE.target.position[2]])
-    unseen = found_pixels(CAMERA) / view.stride**2
-
-    def look():
-        # Another segmenter is compiled anew.
-        full = dataclasses.replace(recogniser("full", target_of(SCENE)), segmenter=Curious())
-        return detected(keys, full, view, SHELF, plain, unseen)
-
-    true = look()
+    full, key = recogniser("full", target_of(SCENE)), jax.random.key(0)
+    true = full.images(key, Snapshot(CAMERA, SHELF, world))
     monkeypatch.setattr(recognisers, "observe", scrambled)
-    assert bool(true[1])
-    jax.tree.map(np.testing.assert_array_equal, look(), true)
+    jax.clear_caches()
+    assert true.mask is None
+    assert true.target_id is None
+    jax.tree.map(np.testing.assert_array_equal, full.images(key, Snapshot(CAMERA, SHELF, world)), true)
+
+
+def test_a_robot_with_the_same_images_recognises_the_same(world, masks, seen):
+    """To the bit: the view's pixels in an image of the whole camera, through the front door."""
+    target, key = target_of(SCENE), jax.random.key(0)
+    robot = Recogniser(types.SimpleNamespace(camera=CAMERA, shelf=SHELF, target=target))
+    images, view = masks.images(key, Snapshot(CAMERA, SHELF, world)), robot.view
+
+    def whole(part, rest):
+        image = np.full((CAMERA.height, CAMERA.width), rest, part.dtype)
+        rows, columns = (
+            first + view.stride * np.arange(n) for first, n in zip((view.row, view.column), part.shape, strict=True)
+        )
+        image[np.ix_(rows, columns)] = part
+        return image
+
+    depth, mask = whole(np.asarray(images.depth), np.nan), whole(np.asarray(images.mask), OTHER)
+    again = robot(jax.random.key(7), depth, mask=mask, target_id=int(images.target_id))
+    jax.tree.map(np.testing.assert_array_equal, again, seen)
 
 
 def test_colours_belong_to_the_scene_and_keep_away_from_the_targets(world):
@@ -266,20 +274,14 @@ def test_without_masks_most_visible_objects_are_separated(world):
 
 @pytest.mark.slow
 def test_a_target_that_is_not_detected_is_given_to_no_object(world):
-    full = recogniser("full", target_of(SCENE))
-    fits = []
-
-    def fitter(*arguments, **options):
-        fits.append(full.fitter(*arguments, **options))
-        return fits[-1]
-
+    full, key, view = recogniser("full", target_of(SCENE)), jax.random.key(0), thinned_view(CAMERA, SHELF)
     x, _, z = SCENE.target.position
-    view = thinned_view(CAMERA, SHELF)
     peeping = moved(world, TARGET, [x, -0.034, z])
-    seen = dataclasses.replace(full, fitter=fitter)(jax.random.key(0), Snapshot(CAMERA, SHELF, peeping))
+    images = full.images(key, Snapshot(CAMERA, SHELF, peeping))
+    fitted, visible, _ = full.core.fitted(CAMERA, view, SHELF, images)
     owner = np.asarray(observe(view.camera, peeping, SHELF).segmentation)
-    labels = np.asarray(fits[0].labels)[owner == TARGET]
-    assert not seen.target_visible
+    labels = np.asarray(fitted.labels)[owner == TARGET]
+    assert not visible
     assert 5 < len(labels) <= found_pixels(CAMERA) / view.stride**2
     assert (labels < 0).all()
-    np.testing.assert_array_equal(seen.confidence > 0.0, seen.objects.valid)
+    np.testing.assert_array_equal(fitted.confidence > 0.0, fitted.objects.valid)

@@ -14,7 +14,7 @@ from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.world import world
 from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
+from mechsearch_jax.shapes.primitives import CYLINDER
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf

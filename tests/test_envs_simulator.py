@@ -15,8 +15,7 @@ from published import published_scenarios
 from mechsearch_jax.actions import KINDS, Action, ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.simulators import simulator
-from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.transforms import make

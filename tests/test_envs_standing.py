@@ -10,7 +10,7 @@ from published import published_scenarios
 
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.scenes.standing import check_standing, faults
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.touching import unrest
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError

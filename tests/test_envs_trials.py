@@ -18,7 +18,7 @@ from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
 from mechsearch_jax.envs.episode.many_slots import ManySlots
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -28,11 +28,12 @@ from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.grasping.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
-from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, decide, scenes_of
-from mechsearch_jax.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
+from mechsearch_jax.planner.step import SearchState, decide
+from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, scenes_of
 from mechsearch_jax.runtime.errors import InputError
 
 TARGET = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.0)
@@ -225,7 +226,12 @@ def test_a_target_that_is_found_must_not_fall_and_one_that_is_not_is_not_there(p
 
 
 def made(policy, trials, problem, belief, observation):
-    return decide(policy, trials, jax.random.key(0), problem, belief, observation)
+    return decided(policy, trials, jax.random.key(0), problem, belief, observation)
+
+
+def decided(policy, trials, key, problem, belief, observation, last=False):
+    state = SearchState(belief, observation, no_action())
+    return decide(policy, trials, key, problem, state, last=last).decision
 
 
 def proposes(*actions):
@@ -344,7 +350,7 @@ def test_an_unsure_grasp_is_made_only_where_no_other_action_is_allowed(problem):
     ):
         trials = grasps_fail_as([*codes, *[FAILED] * (TRIES - 3)])
         arguments = proposes(aside), trials, jax.random.key(0), problem, belief, observation
-        decision = decide(*arguments, last=last)
+        decision = decided(*arguments, last=last)
         assert int(decision.action.kind) == (ActionKind.PUSH if row is None else ActionKind.RETRIEVE)
         if row is not None:
             expected = grasps.actions.T_world_gripper[row]
@@ -354,7 +360,7 @@ def test_an_unsure_grasp_is_made_only_where_no_other_action_is_allowed(problem):
         choices = slots.decide(keys, [0, 1], [0] if last else [])
         assert int(choices[0].action.kind) == int(decision.action.kind)
         without = grasps_fail_as([FAILED if c == UNSURE else c for c in codes] + [FAILED] * (TRIES - 3))
-        other = decide(proposes(aside), without, *arguments[2:])
+        other = decided(proposes(aside), without, *arguments[2:])
         assert int(choices[1].action.kind) == int(other.action.kind)
 
 
@@ -526,7 +532,7 @@ def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
     results = MODEL(problem, scenes_of(beliefs, seen), *jax.device_get((alternatives.actions, alternatives.worth)))
     mapped = jax.jit(jax.vmap(choose))(proposed, results, jnp.zeros(len(rows), bool))
     for i, (belief, observation) in enumerate(rows):
-        alone = decide(policy, MODEL, keys[i], problem, belief, observation)
+        alone = decided(policy, MODEL, keys[i], problem, belief, observation)
         assert int(alone.action.kind) == int(mapped.action.kind[i])
         np.testing.assert_allclose(alone.action.T_world_gripper, mapped.action.T_world_gripper[i], atol=1e-6)
     assert mapped.action.kind.tolist()[:2] == [ActionKind.PUSH, ActionKind.RETRIEVE]
@@ -551,7 +557,7 @@ def slots_of(problem, policy, trials, rows):
     world = stack(*(from_scenario(begin(objects)) for objects, _ in rows))
     slots = ManySlots(problem, policy, oracle, world, 2, trials)
     beliefs, seen = stack(*(look(problem, *row) for row in rows))
-    slots._state = slots._state.replace(belief=beliefs, observation=seen.judged())
+    slots._state = slots._state.replace(search=SearchState(beliefs, seen.judged(), slots._state.search.action))
     return slots, jax.random.split(jax.random.key(0), len(rows))
 
 
@@ -570,7 +576,7 @@ def test_what_is_worth_trying_in_all_slots_is_tried_together(problem):
     for row, chosen in ((0, aside), (2, aside)):
         np.testing.assert_array_equal(choices[row].action.T_world_gripper, chosen.T_world_gripper)
         assert int(choices[row].refused) == 1
-    np.testing.assert_array_equal(slots._state.action.T_world_gripper[2], aside.T_world_gripper)
+    np.testing.assert_array_equal(slots._state.search.action.T_world_gripper[2], aside.T_world_gripper)
     assert slots.decide(keys, []) == {}
 
 
@@ -592,7 +598,7 @@ def test_slots_whose_target_is_not_taken_out_plan(problem):
     assert calls == [[ActionKind.RETRIEVE], [ActionKind.PUSH], [ActionKind.PUSH]]
     for row, (objects, found) in enumerate(rows):
         belief, observation = look(problem, objects, found)
-        alone = decide(proposes(aside), MODEL, keys[row], problem, belief, observation)
+        alone = decided(proposes(aside), MODEL, keys[row], problem, belief, observation)
         assert int(alone.action.kind) == kinds[row]
         np.testing.assert_allclose(alone.action.T_world_gripper, choices[row].action.T_world_gripper, atol=1e-6)
 

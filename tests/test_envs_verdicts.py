@@ -17,8 +17,8 @@ from mechsearch_jax.envs.episode.verdicts import Verdict, free_in_sets, judge, p
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.retrieval import best_grasp, can_be_joined, found_grasps, joined, target_grasps
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.retrieval import best_grasp, can_be_joined, found_grasps, joined, target_grasps
 from mechsearch_jax.workspace.target import Target
 
 

@@ -15,7 +15,7 @@ from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.envs.scenes.scene_sets import find_scene, make_scene
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.existence import ExistenceConfig, closer_look
+from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout
@@ -165,7 +165,7 @@ def test_a_closer_look_keeps_what_the_coarse_image_loses(problem, slivers):
         more = np.asarray(fine.allowed) > config.allowed(problem.camera)
         assert np.any(more)
         assert np.mean(more) < 0.1
-        assert np.all(np.asarray(fine.allowed)[more] <= closer_look.DOUBTFUL)
+        assert np.all(np.asarray(fine.allowed)[more] <= existence.DOUBTFUL)
     assert lost == len(slivers)
 
 

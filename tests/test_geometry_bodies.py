@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax.existence.config import ExistenceConfig
-from mechsearch_jax.existence.views import object_windows
+from mechsearch_jax.existence import ExistenceConfig, object_windows
 from mechsearch_jax.geometry import bodies, superquadric
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.footprints import footprints

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import graspability, planner
+from mechsearch_jax import planner
 from mechsearch_jax.geometry import superquadric, transforms
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.retrieval import best_grasp, target_grasps
+from mechsearch_jax.grasping import graspability
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.retrieval import best_grasp, target_grasps
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError

@@ -14,7 +14,7 @@ from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.colour import RED, TargetColour, hue_difference, rgb_of_hue
 from mechsearch_jax.images.detection import ColouredDepth, densest_place, detect, no_detection
 from mechsearch_jax.images.noise import RandomDirection, depth_of
-from mechsearch_jax.images.target_evidence import depth_tolerance
+from mechsearch_jax.images.target_pose import depth_tolerance
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.benchmarks.lab.looks.bodies import BodiesBench, Truth
-from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
+from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.scenes.household import body_at, standing_height, thing_of
 from mechsearch_jax.envs.world.world import from_scenario
@@ -31,6 +31,7 @@ from mechsearch_jax.perception.parts.unions import (
     select_union,
     union_cost,
 )
+from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.perception.recognition import ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.runtime.errors import InputError
@@ -65,9 +66,8 @@ def seen(*bodies):
     """The labelled image of bodies, its view, and what one superquadric makes of each segment."""
     world = from_scenario(Scenario("parts", bodies, HIDDEN))
     snapshot = Snapshot(CAMERA, SHELF, world)
-    image = labelled(jax.random.key(1), recogniser("masks", TARGET), snapshot.view, SHELF, world, jnp.array(False))
-    keys = jax.random.split(jax.random.key(2))
-    view = snapshot.view
+    view, keys, eyes = snapshot.view, jax.random.split(jax.random.key(2)), recogniser("masks", TARGET)
+    image, _, _ = labelled(eyes.core, keys[0], CAMERA, view, SHELF, eyes.images(jax.random.key(1), snapshot))
     return image, view, as_segmented(keys, image, ShapeNetwork.of(), view.camera, SHELF, TARGET, RefinementConfig())
 
 

@@ -192,7 +192,7 @@ def test_slots_are_callables(images):
     seen = see(KEY, images.depth, images.colour)
     assert not seen.objects.valid.any()
     assert not seen.target_visible
-    assert isinstance(Recogniser(setting(images.camera)).segmenter, NetworkSegmenter)
+    assert isinstance(Recogniser(setting(images.camera)).core.segmenter, NetworkSegmenter)
 
 
 def test_bad_images_are_refused_in_one_line(see, images):

@@ -15,7 +15,7 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.hypotheses import SLOTS
 from mechsearch_jax.perception.parts.segments import Connected, SegmentsConfig, connected_segments
-from mechsearch_jax.perception.recognition import ShapeNetwork
+from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
@@ -126,9 +126,10 @@ def test_each_household_thing_of_a_shelf_has_one_segment():
     world = from_scenario(make_scene(*find_scene("household-4-162")))
     snapshot = Snapshot(Camera(), Shelf(), world)
     view = snapshot.view
-    recogniser = recognisers.recogniser("full-parts", Target.of("cylinder"))
+    eyes, key = recognisers.recogniser("full-parts", Target.of("cylinder")), jax.random.key(0)
+    core = eyes.core
     unseen = found_pixels(snapshot.camera) / view.stride**2
-    seen, _ = recognisers.detected(jax.random.split(jax.random.key(0)), recogniser, view, snapshot.shelf, world, unseen)
+    seen, _, _ = labelled(core, key, snapshot.camera, view, snapshot.shelf, eyes.images(key, snapshot))
     after = np.asarray(connected_segments(seen.points, seen.labels, CONFIG, SAMPLED * unseen))
     true = np.asarray(
         recognisers.true_labels(seen.points, recognisers.observe(view.camera, world, Shelf()).segmentation, Shelf())
@@ -144,11 +145,11 @@ def test_each_household_thing_of_a_shelf_has_one_segment():
     fitted = Connected()(
         jax.random.split(jax.random.key(1)),
         seen,
-        ShapeNetwork.of(recogniser.weights),
+        core.shapes,
         view.camera,
         snapshot.shelf,
-        recogniser.target,
-        recogniser.refinement,
+        core.target,
+        core.refinement,
         least=SAMPLED * unseen,
     )
     np.testing.assert_array_equal(fitted.labels, after)

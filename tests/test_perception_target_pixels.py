@@ -14,8 +14,8 @@ from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.colour import RED, TargetColour
+from mechsearch_jax.images.detection import coloured_pixels, elected, evened, near_target, without_phantoms
 from mechsearch_jax.images.labels import FREE, OTHER
-from mechsearch_jax.images.target_pixels import coloured_pixels, elected, evened, near_target, without_phantoms
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.overlaps import overlap_faults

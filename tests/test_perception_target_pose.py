@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.images.target_pixels import fitted_pose
+from mechsearch_jax.images.detection import fitted_pose
 from mechsearch_jax.images.target_pose import distance, target_poses
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera, back_project, rays

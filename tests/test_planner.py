@@ -11,8 +11,8 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax.actions.candidates import contact_probability
 from mechsearch_jax.actions.kinds.nothing import no_action
-from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.config.config import Weights
@@ -20,8 +20,9 @@ from mechsearch_jax.dynamics.learned import LearnedPush
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import masked, superquadric
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import pairs
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import pairs
+from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner import rollout as rollouts
@@ -29,7 +30,6 @@ from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, propagate_blame, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, repeated, sequence_values
-from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 

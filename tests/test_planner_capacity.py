@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions.sampler import BLOCK, _gumbel
+from mechsearch_jax.actions.candidates import BLOCK, _gumbel
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.geometry.superquadric import empty, pad
-from mechsearch_jax.graspability import INFEASIBLE, graspability, pairs
+from mechsearch_jax.grasping.graspability import INFEASIBLE, graspability, pairs
+from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import present_state
-from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.workspace import scenario
 
 CAPACITIES = (8, 12)

@@ -17,7 +17,7 @@ from mechsearch_jax.belief.moved_target import BEYOND, beyond_candidates, candid
 from mechsearch_jax.config.config import Weights
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import INFEASIBLE, crowding, grasp_hits, graspability, pairs
+from mechsearch_jax.grasping.graspability import INFEASIBLE, crowding, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.shapes.compound import Piece

@@ -122,7 +122,7 @@ def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_pa
     setting = types.SimpleNamespace(camera=Camera(), shelf=Shelf(), target=Target())
     searcher = Searcher(workcell)
     searcher.problem = setting
-    assert searcher.recogniser.detector.func == workcell.detector
+    assert searcher.recogniser.core.detector.func == workcell.detector
 
 
 WRONG = {

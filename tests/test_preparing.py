@@ -16,8 +16,8 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.bodies import PARTS
+from mechsearch_jax.grasping.retrieval import top_grasps
 from mechsearch_jax.planner import policies, search_for_grasp
-from mechsearch_jax.retrieval import top_grasps
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.session import preparing
 from mechsearch_jax.session.preparing import Preparing, Program, first_decision, motions, prepare, prepared

@@ -11,7 +11,7 @@ from mechsearch_jax.envs.health.checks import robot_meshes
 from mechsearch_jax.geometry.swept_cloud import mesh_of
 from mechsearch_jax.robot import gripper as module
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import FINGER, HAND, LINKS, Gripper, Primitive
+from mechsearch_jax.robot.gripper import FINGER, HAND, LINKS, Gripper, RobotPart
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -23,7 +23,7 @@ COLLISION = robot_meshes()
 BOUNDED = {"hand": HAND, "finger": FINGER, "link6": LINKS[5], "link7": LINKS[6]}
 
 
-def signed_distance(primitive: Primitive, points: np.ndarray, swept: float = 0.0) -> np.ndarray:
+def signed_distance(primitive: RobotPart, points: np.ndarray, swept: float = 0.0) -> np.ndarray:
     """Distance to a primitive's surface, negative inside; the primitive may be swept back along z."""
     rotation, centre = primitive.T_frame_primitive[:3, :3], primitive.T_frame_primitive[:3, 3]
     distance = np.full(len(points), np.inf)
@@ -40,11 +40,11 @@ def signed_distance(primitive: Primitive, points: np.ndarray, swept: float = 0.0
     return distance
 
 
-def union_distance(primitives: tuple[Primitive, ...], points: np.ndarray, swept: float = 0.0) -> np.ndarray:
+def union_distance(primitives: tuple[RobotPart, ...], points: np.ndarray, swept: float = 0.0) -> np.ndarray:
     return np.min([signed_distance(primitive, points, swept) for primitive in primitives], axis=0)
 
 
-def surface(primitives: tuple[Primitive, ...]) -> np.ndarray:
+def surface(primitives: tuple[RobotPart, ...]) -> np.ndarray:
     """Points all over the surface of a union."""
     points = np.concatenate(
         [
@@ -136,7 +136,7 @@ def test_the_approach_ends_at_the_tips():
     assert module.swept_cloud(GRIPPER, 0.08, Q7, 100)[:, 2].max() == pytest.approx(TIP, abs=1e-3)
 
 
-def bounding_box(primitives: tuple[Primitive, ...]) -> tuple[np.ndarray, np.ndarray]:
+def bounding_box(primitives: tuple[RobotPart, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Half-extents and centre of the smallest upright box around primitives."""
     bounds = np.array(
         [mesh_of(primitive.kind, primitive.size, primitive.T_frame_primitive).bounds for primitive in primitives]

@@ -28,7 +28,7 @@ from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose
-from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.images.measured import share_step
 from mechsearch_jax.observation import Observation
@@ -36,6 +36,7 @@ from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
+from mechsearch_jax.planner.step import DRAWS
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.hand import HandConfig
@@ -44,7 +45,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session import faults
 from mechsearch_jax.session.faults import check_image, recognition_warnings
 from mechsearch_jax.session.images import converted
-from mechsearch_jax.session.searcher import DRAWS, Searcher
+from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.session.state import beginning
 from mechsearch_jax.session.step import Motion
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig

@@ -14,20 +14,20 @@ from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax import graspability
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
-from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.grasping import graspability
+from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import SHAPES, by_shape, in_order, shape_of
-from mechsearch_jax.shapes.cylinder import Cylinder
+from mechsearch_jax.shapes import SHAPES, Shape, by_shape, in_order, shape_of
+from mechsearch_jax.shapes.primitives import Cylinder
 from mechsearch_jax.viz.drawing import draw_target
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, format_scenario, parse_scenario, superquadrics
@@ -39,7 +39,7 @@ SIZES = np.array([(0.03, 0.03, 0.05), (0.02, 0.06, 0.04), (0.08, 0.05, 0.02)])
 
 
 @dataclasses.dataclass(frozen=True)
-class Ball:
+class Ball(Shape):
     """A shape that the package does not have."""
 
     code: int = 2

@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError, Note
-from mechsearch_jax.shapes import PRIMITIVES, frustum, meshes
+from mechsearch_jax.shapes import PRIMITIVES, meshes, surfaces
 from mechsearch_jax.shapes import compound as compounds
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
 from mechsearch_jax.shapes.meshes import convex_pieces, joined, thinned
 from mechsearch_jax.shapes.parts import PARTS, parts_of, volume_in_common
-from mechsearch_jax.shapes.surfaces import deviation
-from mechsearch_jax.shapes.surfaces.mending import mended
+from mechsearch_jax.shapes.surfaces import mended
 
 HALF = {
     "box": (0.03, 0.02, 0.05),
@@ -101,8 +100,10 @@ def test_what_a_capsule_cannot_be_is_said():
 @pytest.mark.parametrize("ends", [(0.03, 0.05), (0.05, 0.01), (0.03, 0.03)])
 def test_a_frustum_is_a_stack_of_discs_of_its_volume(ends):
     low, high = ends
-    stack = frustum.discs((low, high, 0.04))
-    assert len(stack) == min(max(int(np.ceil(round(abs(high - low) / frustum.STEP, 9))), 1), frustum.MOST)
+    stack = compounds.discs((low, high, 0.04))
+    assert len(stack) == min(
+        max(int(np.ceil(round(abs(high - low) / compounds.DISC_STEP, 9))), 1), compounds.MOST_DISCS
+    )
     exact = np.pi * 0.08 * (low**2 + low * high + high**2) / 3
     assert sum(np.pi * r**2 * 2 * half for _, r, half in stack) == pytest.approx(exact)
     bottoms = [z - half for z, _, half in stack]
@@ -380,13 +381,13 @@ def test_of_too_many_parts_neighbours_are_joined(tmp_path):
 
 def test_the_distance_outside_is_that_to_the_surface():
     points = np.array([(0.0, 0, 0), (0.03, 0, 0), (0.035, 0, 0), (0.05, 0.04, 0.0), (0, 0, 0.2)])
-    assert deviation.farthest_outside(BOX, points[:2], 1e-3) == 0
+    assert surfaces.farthest_outside(BOX, points[:2], 1e-3) == 0
     for count, distance in ((3, 0.005), (4, np.hypot(0.02, 0.01)), (5, 0.075)):
-        assert deviation.farthest_outside(BOX, points[:count], 1e-3) == pytest.approx(distance)
-    np.testing.assert_allclose(deviation.turns_around(BOX, points[[0, 2, 3, 4]]), (1, 0, 0, 0), atol=1e-9)
+        assert surfaces.farthest_outside(BOX, points[:count], 1e-3) == pytest.approx(distance)
+    np.testing.assert_allclose(surfaces.turns_around(BOX, points[[0, 2, 3, 4]]), (1, 0, 0, 0), atol=1e-9)
     aside = np.array((0.1, 0, 0))
     hulls = [BOX.vertices, BOX.vertices + aside]
-    np.testing.assert_allclose(deviation.beyond(hulls, points + 0.15 * aside), (0, 0.015, 0.02, 0.01, 0.075), atol=1e-9)
+    np.testing.assert_allclose(surfaces.beyond(hulls, points + 0.15 * aside), (0, 0.015, 0.02, 0.01, 0.075), atol=1e-9)
 
 
 def test_pieces_that_are_too_thin_are_used_and_said_in_one_line(tmp_path):
@@ -405,4 +406,4 @@ def test_few_corners_are_left_of_many():
 
 
 def test_the_names_of_shapes_do_not_meet():
-    assert not {COMPOUND, CONVEX, frustum.NAME} & set(PRIMITIVES)
+    assert not {COMPOUND, CONVEX, compounds.FRUSTUM} & set(PRIMITIVES)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from test_workspace_target import BOTTLE, CUP, TEE
 
 from mechsearch_jax.shapes import PRIMITIVES, union
-from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, faces, inside, mesh, solids
-from mechsearch_jax.shapes.field import field_of
-from mechsearch_jax.shapes.solid import Union, surface
+from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, faces, half_extents, inside, mesh, solids
+from mechsearch_jax.shapes.solid import solid_of, surface
+from mechsearch_jax.shapes.union import field_of
 
 LEANING = (math.cos(0.3), 0.0, math.sin(0.3), 0.0)
 OCTAHEDRON = tuple(tuple(0.03 * s * (i == j) for j in range(3)) for i in range(3) for s in (1.0, -1.0))
@@ -129,7 +129,7 @@ def multiplied(a, b):
 
 @everyone
 def test_support_and_outline_contain_all_of_it(compound):
-    solid = Union(compound)
+    solid = solid_of(compound, half_extents(compound))
     corners = np.concatenate([np.asarray(mesh(piece).vertices) for piece in solids(compound.pieces)])
     directions = np.random.default_rng(2).normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

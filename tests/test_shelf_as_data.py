@@ -20,6 +20,7 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle, sight_of
 from mechsearch_jax.envs.episode import many_slots
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.world.world import from_scenario
+from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.images.cloud import thinned_view
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
@@ -30,7 +31,6 @@ from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_gra
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.problem.problem import build_problem
-from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.compiled import CachedJit

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from test_workspace_target import BOTTLE, CUP, TEE
 
-from mechsearch_jax.candidate_pairs import filled_up, pair_tables, thinned
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import feasible_grasps, grasp_tables
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import feasible_grasps, filled_up, grasp_tables, pair_tables, thinned
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.identity import Uncompared, identity

@@ -27,8 +27,7 @@ from mechsearch_jax.networks.segmentation import (
 from mechsearch_jax.networks.weights import load_weights, save_weights
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes.box import CODE as BOX
-from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
+from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.train import loop, recognition, scenes, segmentation
 from mechsearch_jax.train.loop import CHECKPOINT, SCALARS, TrainConfig, initial_state, learning_rate, train
 from mechsearch_jax.workspace.shelf import Shelf

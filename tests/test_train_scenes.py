@@ -14,7 +14,7 @@ from mechsearch_jax.images.cloud import above_board, cloud_of, draw, resample, s
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
+from mechsearch_jax.shapes.primitives import CYLINDER
 from mechsearch_jax.train import scenes
 from mechsearch_jax.workspace.camera import Camera, back_project, rays
 from mechsearch_jax.workspace.scenario import Body

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.graspability import INFEASIBLE
+from mechsearch_jax.grasping.graspability import INFEASIBLE
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.viz.blockers import MARK, Moment, blockers_figure

@@ -13,7 +13,7 @@ from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME
 from mechsearch_jax.shapes import Capsule, in_order, shape_of
 from mechsearch_jax.viz.panda import GREY, panda_solids
-from mechsearch_jax.viz.raycast import RAYS, Eye, Solid
+from mechsearch_jax.viz.raycast import RAYS, Eye, VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -37,10 +37,10 @@ def eye(camera=CAMERA):
 
 def solids(world):
     for low, high in shelf_boxes(Shelf()).values():
-        yield Solid(BOARD, (high - low) / 2, np.eye(3), (low + high) / 2, tuple(map(float, seen_by.PALETTE[-1])))
+        yield VisibleSolid(BOARD, (high - low) / 2, np.eye(3), (low + high) / 2, tuple(map(float, seen_by.PALETTE[-1])))
     for i in np.flatnonzero(world.valid):
         fields = (np.asarray(a[i]) for a in (world.half_size, world.rotation, world.position))
-        yield Solid(in_order()[int(world.kind[i])], *fields, tuple(map(float, seen_by.PALETTE[i])))
+        yield VisibleSolid(in_order()[int(world.kind[i])], *fields, tuple(map(float, seen_by.PALETTE[i])))
 
 
 def test_it_sees_what_the_simulated_camera_sees():
@@ -73,7 +73,7 @@ def test_a_pixel_is_the_mean_of_its_rays():
 @pytest.mark.parametrize("distance", [-0.5, 0.0, 4.0])
 def test_what_is_behind_around_or_far_from_the_camera_does_no_harm(distance):
     forward = np.array(CAMERA.rotation)[:, 2]
-    ball = Solid(Capsule(), np.full(3, 0.05), np.eye(3), np.array(CAMERA.position) + distance * forward, GREY)
+    ball = VisibleSolid(Capsule(), np.full(3, 0.05), np.eye(3), np.array(CAMERA.position) + distance * forward, GREY)
     picture = eye().picture([ball])
     assert np.isfinite(picture.colour).all()
     assert np.isinf(picture.depth).all() == (distance <= 0.0)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.workspace import scenario as scenarios
-from mechsearch_jax.workspace.compound_file import parse_compound
+from mechsearch_jax.workspace.scenario import parse_compound
 
 UPRIGHT = [1.0, 0.0, 0.0, 0.0]
 QUARTER = [0.5**0.5, 0.0, 0.0, 0.5**0.5]

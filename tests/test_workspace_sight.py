@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.existence import ExistenceConfig
-from mechsearch_jax.existence.tables import target_window
+from mechsearch_jax.existence import ExistenceConfig, target_window
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import build_problem

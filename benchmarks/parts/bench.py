@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions import Action
+from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.dynamics.learned import NAME, LearnedPush
 from mechsearch_jax.dynamics.named import PushModelName
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
@@ -31,11 +31,12 @@ from mechsearch_jax.envs.scenes.generator import ScenarioGenerator, draws_from
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import grasp_hits, graspability, pairs
+from mechsearch_jax.grasping.graspability import grasp_hits, graspability, pairs
 from mechsearch_jax.networks.weights import load_weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Belief, Config, Decision, Problem
+from mechsearch_jax.planner import Belief, Config, Decision, Problem, step
 from mechsearch_jax.planner import trials as trying
+from mechsearch_jax.planner.step import SearchState
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
@@ -205,7 +206,7 @@ def bench_plan(
         return policy(key, problem, belief, seen)
 
     def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
-        return trying.decide(policy, trials, key, problem, belief, seen)
+        return step.decide(policy, trials, key, problem, SearchState(belief, seen, no_action())).decision
 
     if batch > 1:
         calls = [(problem, *_batch_of(states, batch))]

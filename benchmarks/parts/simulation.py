@@ -17,8 +17,8 @@ from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.mjx_step import commands
 from mechsearch_jax.envs.world.world import World, from_scenario
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.envs.world.compounds import Solids
-from mechsearch_jax.envs.world.world import BODIES, CompoundWorld
+from mechsearch_jax.envs.world.world import BODIES, Solids, World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.transforms import matmul, rotate
-from mechsearch_jax.shapes import PRIMITIVES
+from mechsearch_jax.shapes import PRIMITIVES, union
 from mechsearch_jax.shapes.compound import CONVEX_CODE, MOST_SOLIDS
 from mechsearch_jax.workspace.camera import Camera
 
@@ -26,8 +25,9 @@ SLACK = 1e-3
 RAYS, POINTS = 4096, 1024
 
 
-def placed(world: CompoundWorld) -> Solids:
+def placed(world: World) -> Solids:
     """The solids of all bodies in one row each, in the world: leading axis 144; body `i // 16` owns solid i."""
+    assert world.compounds is not None
     solids = world.compounds.solids
     rotation = matmul(world.rotation[:, None], solids.rotation)
     position = rotate(world.rotation[:, None], solids.position) + world.position[:, None]
@@ -37,7 +37,7 @@ def placed(world: CompoundWorld) -> Solids:
 
 
 def cast_solids(
-    camera: Camera, world: CompoundWorld, directions: Float[Array, "*pixels 3"]
+    camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
 ) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
     """Depth along each ray [m] and the index of the first solid that it hits; infinity and `NONE` where it hits none.
 
@@ -107,26 +107,17 @@ def _cut_in_reach(
 
 
 def cut_polyhedron(origin: list[Array], direction: list[Array], faces: Float[Array, "f 4"]) -> Float[Array, "*pixels"]:
-    """Where rays from outside enter a convex polyhedron; infinite for misses; see `shape.Shape.cut`."""
+    """Where rays from outside enter a convex polyhedron; infinite for misses; see `Primitive.cut`."""
 
-    def clipped(f, span):
-        near, far = span
-        face = faces[f]
-        along = face[0] * direction[0] + face[1] * direction[1] + face[2] * direction[2]
-        height = face[3] - face[0] * origin[0] - face[1] * origin[1] - face[2] * origin[2]
-        safe = jnp.where(jnp.abs(along) < 1e-12, 1e-12, along)
-        where = height / safe
-        return (
-            jnp.where(safe < 0.0, jnp.maximum(near, where), near),
-            jnp.where(safe > 0.0, jnp.minimum(far, where), far),
-        )
+    def crossed(f, state):
+        return union.crossed(faces[f, :3], faces[f, 3], origin, direction, state, jnp)
 
-    everywhere = jnp.zeros_like(direction[0])
-    near, far = jax.lax.fori_loop(0, len(faces), clipped, (everywhere - jnp.inf, everywhere + jnp.inf))
-    return jnp.where((near <= far) & (near > 0.0), near, jnp.inf)
+    start = jnp.full_like(direction[0], jnp.inf), jnp.zeros_like(direction[0])
+    near, far = jax.lax.fori_loop(0, len(faces), crossed, start)
+    return union.entry(near, far, jnp)
 
 
-def solid_normals(world: CompoundWorld, points: Float[Array, "n 3"], solid: Int[Array, " n"]) -> Float[Array, "n 3"]:
+def solid_normals(world: World, points: Float[Array, "n 3"], solid: Int[Array, " n"]) -> Float[Array, "n 3"]:
     """Outward unit normals in the world at points on the surfaces of solids [m].
 
     Args:

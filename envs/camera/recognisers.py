@@ -1,14 +1,13 @@
-"""Recognisers of the simulated world, from the true state to nothing but a depth image.
+"""Recognisers of the simulated world, from the true state to nothing but images.
 
 - `informed` returns the true shapes and poses, and the target's from the start.
 - `oracle` returns the true shapes and poses.
-- `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
-- `full` receives a noisy depth and a noisy colour image alone and segments them.
+- `masks` sees a noisy depth image and true masks, of which it knows the target's number, and knows which pixels show
+  nothing.
+- `full` sees a noisy depth and a noisy colour image, and nothing else.
 - `masks-parts` and `full-parts` are these two with bodies of up to four parts, see `perception.parts.in_parts`.
 
-`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. `oracle` and `masks` know whether
-the target shows more than 100 pixels, and `masks` then which; only the oracle gets the target's pose. `full` finds the
-target by itself in a depth and a colour image, by `images.detection.detect`, as on a robot.
+What sees images is `perception.recogniser.ViewRecogniser`, as on a robot, before the images of the simulated camera.
 """
 
 from __future__ import annotations
@@ -20,31 +19,25 @@ from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing, drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.sensing import Sensing, sensed_depth, true_camera
-from mechsearch_jax.envs.camera.simulated_camera import Image, observe
+from mechsearch_jax.envs.camera.simulated_camera import SHELF, observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.images.cloud import MARGIN, View, above_board
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.images.detection import ColouredDepth, Detection, detect
-from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.images.measured import measured_share
-from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
-from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.noise import NoiseModel, RandomDirection, measured_depth
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.explanation import Explaining, Fitter, as_segmented
+from mechsearch_jax.perception.explanation import Explaining, as_segmented
 from mechsearch_jax.perception.parts.in_parts import InParts
 from mechsearch_jax.perception.parts.joining import join_floating
 from mechsearch_jax.perception.parts.segments import Connected
-from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
-from mechsearch_jax.perception.refinement import RefinementConfig
-from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
+from mechsearch_jax.perception.recogniser import ViewImages, ViewRecogniser
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -69,190 +62,79 @@ def true_labels(
     return jnp.where(jnp.isfinite(points).all(axis=-1), labels, MISSING).astype(jnp.int8)
 
 
-def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:
-    """Labels with segments, numbered from 0, of at most `pixels` pixels set to OTHER."""
-    small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
-    return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageRecogniser:
-    """The `Recogniser` that sees a depth image with masks.
-
-    Recognised shapes have the edges of `superquadric.standard_edges`.
+    """The `Recogniser` that sees images of the simulated camera.
 
     Attributes:
-      target: its shape.
-      weights: of the recognition network.
-      noise: of the depth sensor.
-      refinement: how recognised shapes are refined.
-      fitter: fits objects to the true segments.
+      core: recognises what they show, as on a robot.
+      masks: whether there are true masks with the target's number; else there is a colour image, and the target has to
+        be detected in it.
+      target_colour: red, green and blue in 0 to 1; objects have random other colours, which belong to the scene.
+      noise: of the depth, where `Snapshot.sensing` says nothing.
+      colours: of the colour camera, where `Snapshot.sensing` says nothing.
     """
 
-    target: Target
-    weights: Weights
+    core: ViewRecogniser
+    masks: bool
+    target_colour: tuple[float, float, float] = TargetColour.lit().rgb
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
-    refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
-    fitter: Fitter = as_segmented
+    colours: ColourSensing = dataclasses.field(default_factory=ColourSensing)
+
+    @property
+    def detects_target(self) -> bool:
+        """See `snapshot.Detects`."""
+        return not self.masks
+
+    def images(self, key: Key[Array, ""], snapshot: Snapshot) -> ViewImages:
+        """The images that the camera takes; `key` is of their noise."""
+        colour_of = None if self.masks else self.target_colour
+        sensing = snapshot.sensing or Sensing()
+        return taken(key, snapshot.view, snapshot.shelf, snapshot.world, sensing, colour_of, self.noise, self.colours)
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        view, shelf = snapshot.view, snapshot.shelf
-        keys = jax.random.split(key, 4)
-        image = labelled(keys[0], self, view, shelf, snapshot.world, snapshot.target_seen, snapshot.sensing)
-        seen = snapshot.target_seen
-        if snapshot.sensing is not None and snapshot.sensing.holes is not None:
-            seen &= jnp.sum(image.of_target) > found_pixels(snapshot.camera) / view.stride**2
-            image = image.replace(of_target=image.of_target & seen)
-        shapes = ShapeNetwork.of(self.weights)
-        fitted = self.fitter(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
-        measured = measured_share(snapshot.camera, view, image.depth)
-        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence, measured)
+        return self.core(snapshot.camera, snapshot.view, snapshot.shelf, self.images(key, snapshot))
 
 
-@cached_jit(static_argnames=("recogniser",))
-def labelled(
+@cached_jit(static_argnames=("target_colour", "noise"))
+def taken(
     key: Key[Array, ""],
-    recogniser: ImageRecogniser,
     view: View,
     shelf: Shelf,
     world: World,
-    target_seen: Bool[Array, ""],
-    sensing: Sensing | None = None,
-) -> LabelledImage:
-    """The labelled image that a recogniser fits shapes to: the part that shows the shelf, as measured.
+    sensing: Sensing,
+    target_colour: tuple[float, float, float] | None,
+    noise: NoiseModel,
+    colours: ColourSensing,
+) -> ViewImages:
+    """The images that the simulated camera takes: depth, and colours or true masks.
+
+    Of points that noise moves, an image shows the depth.
 
     Args:
       key: of the noise.
-      recogniser: static.
       view: which rays of a camera are cast.
       shelf: the shelf in the image.
       world: the true state.
-      target_seen: whether the detector sees the target; if not, the image marks no pixels as the target's.
-      sensing: see `Snapshot`; the points lie where they seem to be to the planner.
+      sensing: what of it is not where the planner takes it to be, or measured otherwise.
+      target_colour: red, green and blue in 0 to 1; None for true masks instead of colours; static.
+      noise: of the depth, where `sensing` says nothing; static.
+      colours: of the colour camera, where `sensing` says nothing.
     """
-    image = observe(true_camera(view.camera, sensing), world, shelf)
-    noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
-    points = noise(key, view.camera, sensed_depth(view.camera, world, image, sensing))
-    masks = true_labels(points, image.segmentation, shelf)
-    # Where the true image shows nothing is marked, as in true masks.
-    depth = measured_depth(view.camera, image.depth, points)
-    return LabelledImage(points, depth, masks, (masks == TARGET) & target_seen)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class WeightedSegmenter:
-    """The `NetworkSegmenter` of some weights, as a static value.
-
-    Attributes:
-      weights: of the segmentation network.
-    """
-
-    weights: Weights
-
-    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
-        return NetworkSegmenter.of(self.weights)(key, shelf, points, of_target)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ColourRecogniser:
-    """The `Recogniser` that sees a depth and a colour image, and nothing else.
-
-    Objects have random colours, which belong to the scene. Recognised shapes have the edges of
-    `superquadric.standard_edges`.
-
-    Attributes:
-      target: its shape.
-      detector: finds the target's colour, which is the target's true one.
-      segmenter: says which pixels show which object.
-      weights: of the recognition network.
-      noise: of the depth sensor.
-      camera: of colours, where `Snapshot.sensing` says nothing.
-      refinement: how recognised shapes are refined.
-      fitter: fits objects to the labelled image.
-      detects_target: see `snapshot.Truth`.
-    """
-
-    target: Target
-    detector: TargetColour
-    segmenter: Segmenter
-    weights: Weights
-    noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
-    camera: ColourSensing = dataclasses.field(default_factory=ColourSensing)
-    refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
-    fitter: Fitter = dataclasses.field(default_factory=Explaining)
-    detects_target: bool = True
-
-    def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        view, shelf = snapshot.view, snapshot.shelf
-        keys = jax.random.split(key, 4)
-        unseen = found_pixels(snapshot.camera) / view.stride**2
-        image, seen = detected(keys[:2], self, view, shelf, snapshot.world, unseen, snapshot.sensing)
-        shapes = ShapeNetwork.of(self.weights)
-        settings = (shapes, view.camera, shelf, self.target, self.refinement)
-        fitted = self.fitter(keys[2:], image, *settings, least=SAMPLED * unseen)
-        measured = measured_share(snapshot.camera, view, image.depth)
-        return Observation(fitted.objects, seen, fitted.target_pose, fitted.confidence, measured)
-
-
-def sighted(
-    key: Key[Array, ""],
-    recogniser: ColourRecogniser,
-    view: View,
-    shelf: Shelf,
-    world: World,
-    unseen: float,
-    sensing: Sensing | None = None,
-) -> tuple[Image, Float[Array, "h w 3"], Float[Array, "h w"], Detection]:
-    """The true image, the measured points and their depth, and the target that is detected.
-
-    Args:
-      key: of the noise.
-      recogniser, view, shelf, world, unseen, sensing: see `detected`.
-    """
-    camera = recogniser.camera if sensing is None or sensing.colour is None else sensing.colour
-    appearance = drawn_appearance(scene_key(world), recogniser.detector.rgb, camera.hue_gap)
+    depth_key, colour_key = jax.random.split(key)
+    camera = sensing.colour or colours
+    appearance = None
+    if target_colour is not None:
+        appearance = drawn_appearance(scene_key(world), target_colour, camera.hue_gap)
     image = observe(true_camera(view.camera, sensing), world, shelf, appearance)
-    noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
-    points = noise(key, view.camera, sensed_depth(view.camera, world, image, sensing))
-    depth = depth_of(view.camera, points)
-    # The noise of the depth takes 0 to 2 of this key, see `OtherNoise`.
-    colour = sensed_colour(jax.random.fold_in(key, 3), image.colour, camera)
-    detection = detect(
-        jax.random.fold_in(key, 4),
-        recogniser.detector,
-        recogniser.target,
-        shelf,
-        view.camera,
-        ColouredDepth(points, depth, colour),
-        unseen,
-    )
-    return image, points, depth, detection
-
-
-@cached_jit(static_argnames=("recogniser", "unseen"))
-def detected(
-    keys: Key[Array, "2"],
-    recogniser: ColourRecogniser,
-    view: View,
-    shelf: Shelf,
-    world: World,
-    unseen: float,
-    sensing: Sensing | None = None,
-) -> tuple[LabelledImage, Bool[Array, ""]]:
-    """The labelled image that a recogniser fits shapes to, and whether it shows the target.
-
-    Args:
-      keys: of the noise, and of the segmenter.
-      recogniser: static.
-      view, shelf, world, sensing: see `labelled`.
-      unseen: a target of at most this many pixels of the view is not detected; static.
-    """
-    _, points, depth, detection = sighted(keys[0], recogniser, view, shelf, world, unseen, sensing)
-    # As objects, small segments would rule out the pose of a target that is not detected.
-    segments = recogniser.segmenter(keys[1], shelf, points, detection.pixels | detection.unclear)
-    labels = large_segments(segments, SAMPLED * unseen)
-    of_target = detection.pixels & above_board(shelf, points) & detection.visible
-    return LabelledImage(points, depth, labels, of_target), detection.visible
+    points = (sensing.noise or noise)(depth_key, view.camera, sensed_depth(view.camera, world, image, sensing))
+    depth = measured_depth(view.camera, image.depth, points)
+    if target_colour is None:
+        mask = jnp.where(image.segmentation == SHELF, FREE, image.segmentation)
+        return ViewImages(depth, mask=mask, target_id=jnp.int32(TARGET))
+    # A camera does not tell nothing from what it does not measure.
+    depth = jnp.where(jnp.isfinite(depth), depth, jnp.nan)
+    return ViewImages(depth, sensed_colour(colour_key, image.colour, camera))
 
 
 def recogniser(name: str, target: Target, detector: TargetColour | None = None) -> Recogniser:
@@ -277,12 +159,12 @@ def recogniser(name: str, target: Target, detector: TargetColour | None = None) 
 
 @functools.cache
 def _with_masks(target: Target, several: bool) -> ImageRecogniser:
-    fitter = InParts() if several else as_segmented
-    return ImageRecogniser(target, shipped_weights("recognition"), fitter=fitter)
+    mask_fitter = InParts() if several else as_segmented
+    return ImageRecogniser(ViewRecogniser.of(target, mask_fitter=mask_fitter), masks=True)
 
 
 @functools.cache
-def _alone(target: Target, detector: TargetColour, several: bool) -> ColourRecogniser:
-    segmenter = WeightedSegmenter(shipped_weights("segmentation"))
+def _alone(target: Target, detector: TargetColour, several: bool) -> ImageRecogniser:
     fitter = InParts(Connected(), joining=join_floating) if several else Explaining()
-    return ColourRecogniser(target, detector, segmenter, shipped_weights("recognition"), fitter=fitter)
+    core = ViewRecogniser.of(target, detector=detector, fitter=fitter)
+    return ImageRecogniser(core, masks=False, target_colour=detector.rgb)

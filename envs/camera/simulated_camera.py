@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.camera.compound_rays import cast_solids, solid_normals
 from mechsearch_jax.envs.world.model import shelf_corners
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, TargetCompoundWorld, World
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
@@ -111,7 +111,7 @@ def _cast_bodies(
     camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
 ) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
     """Depth along each ray and the slot of the first body that it hits; infinity and -1 where it hits none."""
-    if isinstance(world, CompoundWorld):
+    if world.compounds is not None:
         depth, solid = cast_solids(camera, world, directions)
         return depth, (solid // MOST_SOLIDS).astype(jnp.int8)
 
@@ -169,7 +169,7 @@ def _wall_normals(shelf: Shelf, point: Float[Array, "n 3"]) -> Float[Array, "n 3
     return walls[wall]
 
 
-def _first_solids(camera: Camera, shelf: Shelf, world: CompoundWorld, directions: Array) -> tuple[Array, Array, Array]:
+def _first_solids(camera: Camera, shelf: Shelf, world: World, directions: Array) -> tuple[Array, Array, Array]:
     """Depth, owner and normal of what rays hit first, as `_first_bodies` of a world with compounds."""
     depth, solid = cast_solids(camera, world, directions)
     behind = cast_shelf(camera, shelf, directions)
@@ -184,7 +184,7 @@ def _first_solids(camera: Camera, shelf: Shelf, world: CompoundWorld, directions
 
 def _first_bodies(camera: Camera, shelf: Shelf, world: World, directions: Array) -> tuple[Array, Array, Array]:
     """Depth along each ray, what it hits first, as `Image.segmentation`, and the normal there."""
-    if isinstance(world, CompoundWorld):
+    if world.compounds is not None:
         return _first_solids(camera, shelf, world, directions)
     depth, owner = _cast_bodies(camera, world, directions)
     behind = cast_shelf(camera, shelf, directions)
@@ -218,9 +218,9 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None, appearance
 def _pictured(world: World) -> Appearance:
     """The appearance in pictures: objects that are compounds have their own colours, if they have any."""
     colours: jax.Array | np.ndarray = PALETTE
-    if isinstance(world, CompoundWorld):
+    if world.compounds is not None:
         given = world.compounds.matter.colour
-        if isinstance(world, TargetCompoundWorld):
+        if world.target is not None:
             given = given.at[TARGET].set(jnp.nan)
         bodies = jnp.where(jnp.isnan(given), PALETTE[:BODIES], given)
         colours = jnp.concatenate([bodies, PALETTE[BODIES:]])
@@ -247,8 +247,8 @@ def target_window(camera: Camera, half_size: Sequence[float] = USUAL_HALF_SIZE) 
 
 def window_of(camera: Camera, world: World) -> int:
     """`target_window` of the target in a world; the usual one's if it is no compound."""
-    if isinstance(world, TargetCompoundWorld):
-        return target_window(camera, world.room)
+    if world.target is not None:
+        return target_window(camera, world.target.room)
     return target_window(camera)
 
 

@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import ARM, LAG, ROBOT
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES, TARGET, slots

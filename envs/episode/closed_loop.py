@@ -35,8 +35,7 @@ from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch, TrueCell
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.planner import Policy, Problem
-from mechsearch_jax.planner.noted_trials import nothing_tried
-from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.planner.trials import Trials, nothing_tried
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.scenario import Scenario
 
@@ -277,19 +276,16 @@ class EpisodePool:
     def _moment(self, choices: Mapping[int, Choice]) -> Moment | None:
         """What is known in a single slot, for a watcher."""
         slot = self._planner
-        if (
-            self._listeners.watcher is None
-            or not isinstance(slot, OneSlot)
-            or slot.snapshot is None
-            or slot.observation is None
-            or slot.truth is None
-        ):
+        if self._listeners.watcher is None or not isinstance(slot, OneSlot):
             return None
-        log, bodies = self.running[0].log, np.asarray(slot.truth.bodies)
-        decision = named_decision(slot.decision, bodies) if 0 in choices and slot.decision is not None else None
-        seen = named_observation(slot.observation, bodies)
-        tried = nothing_tried() if slot.noted is None else named_tried(slot.noted.tried(), bodies)
-        return Moment(log.index, slot.snapshot, seen, slot.belief, decision, log.steps[-1], None, tried)
+        state, snapshot, truth, decided = slot.state, slot.snapshot, slot.truth, slot.decided
+        if state is None or snapshot is None or truth is None:
+            return None
+        log, bodies = self.running[0].log, np.asarray(truth.bodies)
+        decision = named_decision(decided.decision, bodies) if 0 in choices and decided is not None else None
+        seen = named_observation(state.observation, bodies)
+        tried = nothing_tried() if decided is None else named_tried(decided.tried, bodies)
+        return Moment(log.index, snapshot, seen, state.belief, decision, log.steps[-1], None, tried)
 
 
 def _chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, Array]:

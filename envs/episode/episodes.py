@@ -27,7 +27,7 @@ from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.episode.moments import Watcher
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
-from mechsearch_jax.envs.simulators.simulator import Prepares, Simulator, TakesCells
+from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.world import World, from_scenario
 from mechsearch_jax.planner import Policy, Problem
 from mechsearch_jax.runtime.errors import InputError
@@ -157,7 +157,7 @@ def _set_cells(simulator: Simulator, problem: Problem, starts: Mapping[int, Star
     Raises:
       InputError: one of them is not as the planner assumes, and the simulator cannot differ.
     """
-    if isinstance(simulator, TakesCells):
+    if simulator.takes_cells:
         simulator.set_cells({row: start.cell(problem) for row, start in starts.items()})
     elif any(start.mismatch.simulates_otherwise for start in starts.values()):
         raise InputError(f"{simulator.engine}: cannot differ from what the planner assumes; use the NativeSimulator")
@@ -172,7 +172,7 @@ def batch_programs(planner_slots: ManySlots, simulator: Simulator, world: World)
       world: of all slots, or its shapes.
     """
     deciding, *seeing = planner_slots.programs(world)
-    simulating = simulator.programs(world) if isinstance(simulator, Prepares) else []
+    simulating = simulator.programs(world)
     kernels = [task for task in simulating if task.name == "kernels"]
     keys = jax.ShapeDtypeStruct((len(world.kind), 2, *jax.random.key_data(jax.random.key(0)).shape), np.uint32)
     stepping = program("small ones", keys_at, keys, jax.ShapeDtypeStruct((len(world.kind),), np.int32))

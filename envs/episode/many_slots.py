@@ -13,17 +13,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
-from mechsearch_jax.belief.belief import sweeps_unmeasured, without_grasps
+from mechsearch_jax.belief.belief import without_grasps
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, Truth, sight_of, truth_of, truth_unseen
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, compile_key, numbers, with_numbers
-from mechsearch_jax.envs.episode.slots import BeliefSummary, may_be_blind, sizes_and_truths, summary
+from mechsearch_jax.envs.episode.slots import BeliefSummary, is_blind, may_be_blind, sizes_and_truths, summary
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner import Decision, Policy, Problem, initial_belief
 from mechsearch_jax.planner.learning import LearnedFriction, LearnsFriction
+from mechsearch_jax.planner.step import SearchState, believe, propose, unsearched
 from mechsearch_jax.planner.trials import TrialResult, Trials, TrialScenes, TwoStagePolicy, choose, scenes_of
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
@@ -55,12 +55,10 @@ HIDDEN, FOUND, RETRIEVAL = Question("planned", hidden=True), Question("planned")
 ANYTHING = Question("__call__")
 
 
-class PlannerState(flax.struct.PyTreeNode):
+class SlotState(flax.struct.PyTreeNode):
     """What the planner knows in every slot, and the truth of its looks; fields have a leading axis for the slots."""
 
-    belief: Belief
-    observation: Observation
-    action: Action
+    search: SearchState
     truth: Truth
 
 
@@ -110,8 +108,8 @@ class ManySlots:
             shapes,
             sensing,
         )
-        empty = PlannerState(initial_belief(problem), seen, no_action(), truth_unseen())
-        self._state: PlannerState = jax.tree.map(
+        empty = SlotState(unsearched(problem, seen), truth_unseen())
+        self._state: SlotState = jax.tree.map(
             lambda a: jax.device_put(np.zeros((self._count, *a.shape), a.dtype)), empty
         )
 
@@ -130,7 +128,7 @@ class ManySlots:
         fresh = jax.ShapeDtypeStruct((self._count,), bool)
         problem, state = self._problem, self._state
         questions = [HIDDEN, FOUND, RETRIEVAL] if isinstance(self._policy, TwoStagePolicy) else [ANYTHING]
-        calls = [(self._policy, own, problem, state, keys, rows, question) for question in questions]
+        calls = [(self._policy, own, problem, state.search, keys, rows, question) for question in questions]
 
         def choosing(call: tuple[Any, ...]) -> Callable[[], None] | None:
             decision, _ = _propose.returns(*call)
@@ -145,7 +143,7 @@ class ManySlots:
             *(Program("small ones", lambda: False, functools.partial(choosing, call)) for call in calls),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight, self._sensing),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
-            program("small ones", sizes_and_truths, problem, state.belief.exists, world),
+            program("small ones", sizes_and_truths, problem, state.search.belief.exists, world),
             program("small ones", _forget, problem, state, fresh),
             program("small ones", _note, state, done, rows),
             program("small ones", _some_worlds, world, rows),
@@ -179,15 +177,16 @@ class ManySlots:
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
-        before = self._state
+        before = self._state.search
         for _, padded in self._chunks(rows):
             self._state = _look(
                 self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
             )
+        now = self._state.search
         if self._learned is not None:
-            searches = scenes_of(before.belief, before.observation), before.action, self._state.observation.objects
+            searches = scenes_of(before.belief, before.observation), before.action, now.observation.objects
             self._learned.learn(self._problem, rows, *jax.tree.map(lambda a: a[list(rows)], jax.device_get(searches)))
-        return summary(self._problem, self._state.belief, self._state.truth, in_base(world, self._sensing))
+        return summary(self._problem, now.belief, self._state.truth, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int], last: Collection[int] = ()) -> dict[int, Choice]:
         """See `Slots`.
@@ -197,7 +196,7 @@ class ManySlots:
         """
         if not isinstance(self._policy, TwoStagePolicy):
             return self._ask(ANYTHING, keys, rows, last)
-        there = np.asarray(self._state.belief.found)
+        there = np.asarray(self._state.search.belief.found)
         choices = self._ask(RETRIEVAL, keys, [r for r in rows if there[r]], last)
         choices = {r: choice for r, choice in choices.items() if takes_target(choice)}
         choices |= self._ask(FOUND, keys, [r for r in rows if there[r] and r not in choices], last)
@@ -211,16 +210,16 @@ class ManySlots:
             # Rows beyond the end decide by anything.
             each = [self._numbers[r] for r in chunk] + [self._numbers[chunk[0]]] * (self._at_once - len(chunk))
             own = tuple(np.stack(values) for values in zip(*each, strict=True))
-            proposed.append(_propose(self._policy, own, self._problem, self._state, keys, padded, question))
+            proposed.append(_propose(self._policy, own, self._problem, self._state.search, keys, padded, question))
         choices: dict[int, Choice] = {}
         for (chunk, padded), (decision, _), results in zip(
             chunks, proposed, self._tried([chunk for chunk, _ in chunks], proposed), strict=True
         ):
             over = np.array([r in last for r in chunk] + [False] * (self._at_once - len(chunk)))
             decided = _choose(decision, results, jax.device_put(over))
-            if may_be_blind(self._state.belief):
-                decided = decided.replace(blind=_blind(self._problem, self._state, decided.action, padded))
             self._state = _note(self._state, decided.action, padded)
+            if may_be_blind(self._state.search.belief):
+                decided = decided.replace(blind=_blind(self._problem, self._state.search, padded))
             choice = jax.device_get(decided)
             choices |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(chunk)}
         return choices
@@ -284,50 +283,50 @@ def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
 
 
 @cached_jit()
-def _blind(problem: Problem, state: PlannerState, action: Action, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
-    """Whether actions in the slots `rows` sweep space that was not measured."""
-    here = _rows_of(state, rows)
-    sweeps = functools.partial(sweeps_unmeasured, problem)
-    return jax.vmap(sweeps)(here.belief, here.observation.objects, action)
+def _blind(problem: Problem, state: SearchState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
+    """`is_blind` in the slots `rows`."""
+    return jax.vmap(functools.partial(is_blind, problem))(_rows_of(state, rows))
 
 
 @cached_jit()
-def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
+def _forget(problem: Problem, state: SlotState, fresh: Bool[Array, " slots"]) -> SlotState:
     """Let the fresh slots know nothing."""
+    search = state.search
     belief, action = jax.tree.map(
         lambda new, old: jnp.where(fresh.reshape(-1, *[1] * new.ndim), new[None], old),
         (initial_belief(problem), no_action()),
-        (state.belief, state.action),
+        (search.belief, search.action),
     )
-    return state.replace(belief=belief, action=action, truth=state.truth.replace(shown=state.truth.shown & ~fresh))
+    return SlotState(
+        search.replace(belief=belief, action=action), state.truth.replace(shown=state.truth.shown & ~fresh)
+    )
 
 
 @cached_jit()
-def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> PlannerState:
+def _note(state: SlotState, action: Action, rows: Int[Array, " n"]) -> SlotState:
     """Keep what was decided in the slots `rows` until the next look."""
-    return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
+    action = jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.search.action, action)
+    return state.replace(search=state.search.replace(action=action))
 
 
 @cached_jit(static_argnames=("recogniser",))
 def _look(
     problem: Problem,
-    state: PlannerState,
+    state: SlotState,
     world: World,
     keys: Array,
     rows: Int[Array, " n"],
     recogniser: Recogniser,
     sight: Sight,
     sensing: Sensing | None,
-) -> PlannerState:
+) -> SlotState:
     """Recognise and update the belief in the slots `rows`, with the sight of the problem's camera."""
 
-    def look(slot_state, here, key, sensed):
+    def look(slot, here, key, sensed):
         snapshot = Snapshot(problem.camera, problem.shelf, here, sight, sensed)
         observation = recogniser(key, snapshot)
-        belief = update_belief(problem, slot_state.belief, observation, slot_state.observation, slot_state.action)
-        truth = truth_of(recogniser, snapshot, observation)
-        truth = truth.since(slot_state.truth, observation)
-        return PlannerState(belief, observation, no_action(), truth)
+        truth = truth_of(recogniser, snapshot, observation).since(slot.truth, observation)
+        return SlotState(believe(problem, slot.search, observation), truth)
 
     new = jax.vmap(look)(
         _rows_of(state, rows), _some_worlds(world, rows), _rows_of(keys, rows), _rows_of(sensing, rows)
@@ -340,35 +339,27 @@ def _propose(
     policy: Policy,
     own: tuple[Array, ...],
     problem: Problem,
-    state: PlannerState,
+    state: SearchState,
     keys: Array,
     rows: Int[Array, " n"],
     question: Question,
 ) -> tuple[Decision, TrialScenes]:
-    """What the policy decides in the slots `rows` before trials, and the scenes to try it in.
+    """What the policy proposes in the slots `rows`, and the scenes to try it in.
 
     The numbers in `own`, shape (n,) each, are in place of the policy's own. The question is static.
     """
 
-    def propose(values, key, slot_state):
-        ask = getattr(with_numbers(policy, values), question.method)
-        return _strong(
-            (
-                ask(key, problem, slot_state.belief, slot_state.observation),
-                scenes_of(slot_state.belief, slot_state.observation),
-            )
-        )
+    def ask(values, key, slot):
+        decision = propose(with_numbers(policy, values), question.method, key, problem, slot)
+        return _strong((decision, scenes_of(slot.belief, slot.observation)))
 
-    slot_state, active = _rows_of(state, rows), rows < keys.shape[0]
+    here, active = _rows_of(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
-    belief = slot_state.belief.replace(
-        exists=slot_state.belief.exists & active[:, None], found=slot_state.belief.found & active
-    )
+    belief, objects = here.belief, here.observation.objects
+    belief = belief.replace(exists=belief.exists & active[:, None], found=belief.found & active)
     belief = without_grasps(belief) if question.hidden else belief
-    objects = slot_state.observation.objects
-    objects = objects.replace(valid=objects.valid & active[:, None])
-    seen = slot_state.observation.replace(objects=objects)
-    return jax.vmap(propose)(own, _rows_of(keys, rows), slot_state.replace(belief=belief, observation=seen))
+    observation = here.observation.replace(objects=objects.replace(valid=objects.valid & active[:, None]))
+    return jax.vmap(ask)(own, _rows_of(keys, rows), here.replace(belief=belief, observation=observation))
 
 
 @cached_jit()

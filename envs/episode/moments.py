@@ -10,7 +10,7 @@ from mechsearch_jax.envs.episode.records import Step
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision
-from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
+from mechsearch_jax.planner.trials import TriedActions, nothing_tried
 
 
 @dataclasses.dataclass(frozen=True)

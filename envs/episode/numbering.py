@@ -10,7 +10,7 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision
-from mechsearch_jax.planner.noted_trials import TriedActions
+from mechsearch_jax.planner.trials import TriedActions
 
 # The number of the body that each recognised object stands for.
 Bodies = Int[np.ndarray, " objects"]

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.belief.belief import sweeps_unmeasured
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.sensing import Sensing, in_base
@@ -24,11 +23,10 @@ from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, Truth, tru
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner import Belief, Policy, Problem
 from mechsearch_jax.planner.learning import restored
-from mechsearch_jax.planner.noted_trials import NotedTrials
-from mechsearch_jax.planner.trials import Trials, decide
+from mechsearch_jax.planner.step import Decided, SearchState, believe, decide, unsearched
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.compiled import cached_jit
 
 
@@ -109,12 +107,9 @@ class OneSlot:
 
     Attributes:
       snapshot: the shelf at the last look.
-      observation: the recognised scene.
-      belief: about the target.
-      decision: of the policy; None between a look and its decision.
-      action: the decision's, to be executed before the next look; of kind NONE before the first.
+      state: what the search knows after it, and what was decided since; None before the first.
+      decided: by the policy after trials; None between a look and its decision.
       truth: of the last look, and whether the target was detected at any; None before the first.
-      noted: what the trials of the decision came to; None without trials or a decision.
     """
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
@@ -124,12 +119,9 @@ class OneSlot:
         trials: in which actions are tried before one is made; None for no trials.
         """
         self.snapshot: Snapshot | None = None
-        self.observation: Observation | None = None
-        self.belief = initial_belief(problem)
-        self.decision: Decision | None = None
-        self.action: Action = no_action()
+        self.state: SearchState | None = None
+        self.decided: Decided | None = None
         self.truth: Truth | None = None
-        self.noted: NotedTrials | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
         self._learned = restored(trials, {})
@@ -138,8 +130,7 @@ class OneSlot:
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
         if fresh[0]:
-            self.belief = initial_belief(self._problem)
-            self.action, self.observation, self.truth = no_action(), None, None
+            self.state, self.truth = None, None
             if self._learned is not None:
                 self._learned.forget(fresh)
 
@@ -156,33 +147,27 @@ class OneSlot:
         """See `Slots`."""
         snapshot = dataclasses.replace(self._snapshot(world), sensing=self._sensing)
         observation = self._recogniser(keys[0], snapshot)
-        # The first look, before any action, makes the same call, so that nothing is compiled twice.
-        before = observation if self.observation is None else self.observation
+        before = unsearched(self._problem, observation) if self.state is None else self.state
         if self._learned is not None:
-            self._learned.learn_first(self._problem, self.belief, before, self.action, observation)
-        self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
-        self.action = no_action()
+            self._learned.learn_first(self._problem, before, observation)
+        self.state = believe(self._problem, before, observation)
         truth = truth_of(self._recogniser, snapshot, observation)
         self.truth = truth if self.truth is None else truth.since(self.truth, observation)
-        self.snapshot, self.observation, self.decision, self.noted = snapshot, observation, None, None
-        belief, seen = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), (self.belief, self.truth))
+        self.snapshot, self.decided = snapshot, None
+        belief, seen = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), (self.state.belief, self.truth))
         return summary(self._problem, belief, seen, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int], last: Collection[int] = ()) -> dict[int, Choice]:
         """See `Slots`."""
         if not rows:
             return {}
-        assert self.observation is not None
+        assert self.state is not None
         trials = self._trials if self._learned is None else self._learned.trials([0])
-        self.noted = None if trials is None else NotedTrials(trials)
-        self.decision = decide(
-            self._policy, self.noted, keys[0], self._problem, self.belief, self.observation, 0 in last
-        )
-        self.action = self.decision.action
-        choice = chosen(self.decision)
-        if may_be_blind(self.belief):
-            objects = self.observation.objects
-            choice = choice.replace(blind=sweeps_unmeasured(self._problem, self.belief, objects, self.action))
+        self.decided = decide(self._policy, trials, keys[0], self._problem, self.state, last=0 in last)
+        self.state = self.state.replace(action=self.decided.decision.action)
+        choice = chosen(self.decided.decision)
+        if may_be_blind(self.state.belief):
+            choice = choice.replace(blind=is_blind(self._problem, self.state))
         return {0: jax.device_get(choice)}
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -192,6 +177,11 @@ class OneSlot:
     def _snapshot(self, world: World) -> Snapshot:
         single = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[0]), world)
         return Snapshot(self._problem.camera, self._problem.shelf, single)
+
+
+def is_blind(problem: Problem, state: SearchState) -> Bool[Array, ""]:
+    """Whether a state's action sweeps space that was not measured."""
+    return sweeps_unmeasured(problem, state.belief, state.observation.objects, state.action)
 
 
 def may_be_blind(belief: Belief) -> bool:

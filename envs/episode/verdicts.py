@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner import Problem, paper
-from mechsearch_jax.retrieval import (
+from mechsearch_jax.grasping.retrieval import (
     TargetGrasps,
     can_be_joined,
     found_grasps,
@@ -23,6 +22,7 @@ from mechsearch_jax.retrieval import (
     joined,
     target_grasps,
 )
+from mechsearch_jax.planner import Problem, paper
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.session.preparing import Program, program

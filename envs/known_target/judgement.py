@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.graspability import no_hits, pairs
+from mechsearch_jax.grasping.graspability import no_hits, pairs
+from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasps, found_grasps, found_hits
 from mechsearch_jax.planner import Belief, PlanningPolicy, Problem, Sequences, initial_belief
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
 from mechsearch_jax.planner.rollout import plan, present_state
-from mechsearch_jax.retrieval import GraspChoice, best_grasps, found_grasps, found_hits
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,7 +27,8 @@ def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    arrays = flatten_dict(serialization.to_state_dict(pushes), sep="/")
+    state = flatten_dict(serialization.to_state_dict(pushes), sep="/")
+    arrays = {name: value for name, value in state.items() if value is not None}
     with replacing(path) as file:
         np.savez(file, identity=np.array(identity), **arrays)  # pyright: ignore[reportArgumentType]
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Key
 
 from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTables, action_tables
-from mechsearch_jax.actions.kinds.push_starts import away_from_robot, contact_height
+from mechsearch_jax.actions.kinds.push import away_from_robot, contact_height
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world.world import TARGET, World, superquadrics

@@ -10,17 +10,18 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World, bodies_of
-from mechsearch_jax.shapes import PRIMITIVES, in_order
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of
+from mechsearch_jax.shapes import PRIMITIVES, in_order, union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, hull, solids, surface_points
-from mechsearch_jax.viz.raycast import Colour, Solid
+from mechsearch_jax.shapes.primitives import Primitive
+from mechsearch_jax.viz.raycast import Colour, VisibleSolid
 
 if TYPE_CHECKING:
     import trimesh
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Polyhedron:
+class Polyhedron(Primitive):
     """A convex polyhedron as a surface of pictures, whatever half-extents are said.
 
     Attributes:
@@ -34,26 +35,18 @@ class Polyhedron:
     def cut(
         self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
     ) -> Float[Any, "*rays"]:
-        """See `shapes.Shape.cut`."""
-        near, far = library.full_like(direction[0], -np.inf), library.full_like(direction[0], np.inf)
-        for x, y, z, reach in self.planes.tolist():
-            along = x * direction[0] + y * direction[1] + z * direction[2]
-            height = reach - x * origin[0] - y * origin[1] - z * origin[2]
-            safe = library.where(library.abs(along) < 1e-12, 1e-12, along)
-            where = height / safe
-            near = library.where(safe < 0.0, library.maximum(near, where), near)
-            far = library.where(safe > 0.0, library.minimum(far, where), far)
-        return library.where((near <= far) & (near > 0.0), near, np.inf)
+        near, far = library.full_like(direction[0], np.inf), library.full_like(direction[0], 0.0)
+        for *normal, offset in self.planes.tolist():
+            near, far = union.crossed(normal, offset, origin, direction, (near, far), library)
+        return union.entry(near, far, library)
 
     def normal(
         self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
     ) -> Float[Any, "*batch 3"]:
-        """See `shapes.Shape.normal`."""
         above = point @ self.planes[:, :3].T - self.planes[:, 3]
         return self.planes[:, :3][library.argmax(above, axis=-1)]
 
     def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
-        """Its surface in its own frame."""
         return hull(self.piece).copy()
 
 
@@ -63,13 +56,13 @@ def slot_colour(index: int) -> Colour:
     return red, green, blue
 
 
-def body_solids(world: World) -> dict[int, list[Solid]]:
+def body_solids(world: World) -> dict[int, list[VisibleSolid]]:
     """The solids of the bodies that are there, by slot, each in the frame of its body.
 
     Args:
       world: NumPy arrays without leading axes.
     """
-    bodies = bodies_of(world) if isinstance(world, CompoundWorld) else [None] * BODIES
+    bodies = [None] * BODIES if world.compounds is None else bodies_of(world)
     shown = {}
     for i in np.flatnonzero(world.valid).tolist():
         body = bodies[i]
@@ -77,14 +70,14 @@ def body_solids(world: World) -> dict[int, list[Solid]]:
             shown[i] = _of_compound(body.compound, i)
         else:
             shape, half = in_order()[int(world.kind[i])], np.asarray(world.half_size[i])
-            shown[i] = [Solid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))]
+            shown[i] = [VisibleSolid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))]
     return shown
 
 
-def _of_compound(compound: Compound, slot: int) -> list[Solid]:
+def _of_compound(compound: Compound, slot: int) -> list[VisibleSolid]:
     colour = slot_colour(slot) if slot == TARGET else compound.colour or slot_colour(slot)
     return [
-        Solid(_surface(solid), _half(solid), solid.rotation, np.array(solid.position), colour)
+        VisibleSolid(_surface(solid), _half(solid), solid.rotation, np.array(solid.position), colour)
         for solid in solids(compound.pieces)
     ]
 
@@ -98,14 +91,14 @@ def _half(solid: Piece) -> Float[np.ndarray, " 3"]:
     return np.abs(np.array(solid.vertices)).max(axis=0) if solid.shape == CONVEX else np.array(solid.half_size)
 
 
-def moved(solid: Solid, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"]) -> Solid:
+def moved(solid: VisibleSolid, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"]) -> VisibleSolid:
     """A solid in the world, from that in the frame of its body, which has a pose."""
     return dataclasses.replace(solid, rotation=rotation @ solid.rotation, position=rotation @ solid.position + position)
 
 
 def body_points(world: World) -> dict[int, Float[np.ndarray, "points 3"]]:
     """Points whose hull contains each body that is there, by slot, in its own frame [m]; see `body_solids`."""
-    bodies = bodies_of(world) if isinstance(world, CompoundWorld) else [None] * BODIES
+    bodies = [None] * BODIES if world.compounds is None else bodies_of(world)
     points = {}
     for i in np.flatnonzero(world.valid).tolist():
         body = bodies[i]

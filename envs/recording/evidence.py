@@ -19,12 +19,11 @@ from mechsearch_jax.envs.camera.snapshot import objects_on_the_board, true_targe
 from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.recording.sampled import Sampled, sampled
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import INFEASIBLE
+from mechsearch_jax.grasping.graspability import INFEASIBLE
+from mechsearch_jax.grasping.retrieval import TargetGrasps, found_grasps, found_hits
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Problem, graspability_map, initial_belief, update_belief
-from mechsearch_jax.planner.noted_trials import TriedActions, nothing_tried
-from mechsearch_jax.planner.trials import TrialResult
-from mechsearch_jax.retrieval import TargetGrasps, found_grasps, found_hits
+from mechsearch_jax.planner.trials import TrialResult, TriedActions, nothing_tried
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.session.preparing import Program, program
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS

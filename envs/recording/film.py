@@ -22,7 +22,7 @@ from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.film import Layout, Moving, Page
 from mechsearch_jax.viz.panda import panda_solids
-from mechsearch_jax.viz.raycast import Eye, Solid
+from mechsearch_jax.viz.raycast import Eye, VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -110,12 +110,13 @@ def _in_lots(rows: Iterator[int], size: int) -> Iterator[list[int]]:
         yield lot
 
 
-def shelf_solids(shelf: Shelf) -> dict[str, Solid]:
+def shelf_solids(shelf: Shelf) -> dict[str, VisibleSolid]:
     """The shelf's boards by name, without those in `LEFT_OUT`."""
     boxes = {name: box for name, box in shelf_boxes(shelf).items() if name not in LEFT_OUT}
     board, colour = shape_of("box"), slot_colour(SHELF)
     return {
-        name: Solid(board, (high - low) / 2, np.eye(3), (low + high) / 2, colour) for name, (low, high) in boxes.items()
+        name: VisibleSolid(board, (high - low) / 2, np.eye(3), (low + high) / 2, colour)
+        for name, (low, high) in boxes.items()
     }
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import kind_of
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.envs.camera.simulated_camera import Image
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle, true_target_pose, truth_of
 from mechsearch_jax.envs.episode.moments import Moment

@@ -51,6 +51,7 @@ TRACE_EVERY = 10
 _SETTINGS: dict[str, type] = {"camera": Camera, "shelf": Shelf, "target": Target}
 _TEXTS = ("title", "caption", "found")
 _ARRAYS = ("existence", "graspability", "target_pose")
+_NOT_ARRAYS = ("parts", "compounds", "target")
 _TREES: dict[str, type] = {"world": World, "scene": Superquadrics, "after": Superquadrics, "action": Action}
 # Those whose bodies may have parts.
 _WITH_PARTS = ("scene", "after")
@@ -284,8 +285,8 @@ def _step(arrays: dict[str, np.ndarray], texts: dict[str, Any], i: int, rows: sl
 
 
 def _fields(kind: type) -> tuple[str, ...]:
-    """The names of the arrays of a pytree; parts of bodies are kept beside them."""
-    return tuple(field.name for field in dataclasses.fields(kind) if field.name != "parts")
+    """The names of the arrays of a pytree; parts of bodies are kept beside them, and what they are made of is not."""
+    return tuple(field.name for field in dataclasses.fields(kind) if field.name not in _NOT_ARRAYS)
 
 
 def _written(setting: Any) -> dict[str, Any]:

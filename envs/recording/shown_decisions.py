@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mechsearch_jax.actions import kind_of
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing, sketches, web

@@ -16,12 +16,12 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import GraspTables, candidate_grasps, feasible_grasps, grasp_tables
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import GraspTables, candidate_grasps, feasible_grasps, grasp_tables
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError

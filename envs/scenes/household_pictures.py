@@ -14,7 +14,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import solids, surface_points
-from mechsearch_jax.viz.raycast import Eye, Solid
+from mechsearch_jax.viz.raycast import Eye, VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 
 COLUMNS, SIDE = 7, 200
@@ -44,7 +44,7 @@ def picture_of(thing: Thing) -> UInt8[np.ndarray, "h w 3"]:
     eye = Eye(_camera((low + high) / 2, float(np.linalg.norm(high - low))), LIGHT, AMBIENT, PAPER)
     colour = thing.compound.colour or (0.5, 0.5, 0.5)
     drawn = [
-        Solid(PRIMITIVES[s.shape], np.array(s.half_size), s.rotation, np.array(s.position), colour)
+        VisibleSolid(PRIMITIVES[s.shape], np.array(s.half_size), s.rotation, np.array(s.position), colour)
         for s in solids(thing.compound.pieces)
     ]
     return eye.picture(drawn).pixels

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.envs.scenes.scene_sets import find_scene, is_recorded
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT
 from mechsearch_jax.envs.world.touching import name_of
 from mechsearch_jax.envs.world.world import BODIES, slots

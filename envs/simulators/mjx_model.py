@@ -20,14 +20,13 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool
 
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
-from mechsearch_jax.envs.simulators.compound_batch import CompoundFields, compound_fields
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, CompoundFields, body_fields, compound_fields
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
 from mechsearch_jax.envs.simulators.warp_streams import keep_streams
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Overflow
-from mechsearch_jax.envs.world.world import BODIES, TARGET, CompoundWorld, World
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.compound import Compound
@@ -99,7 +98,7 @@ class MjxModel:
     """The model that all worlds share, and functions of it.
 
     Attributes:
-      room: the compounds in its slots, see `compound_batch.room_for`; none in a model of plain worlds.
+      room: the compounds in its slots, see `batch_model.room_for`; none in a model of plain worlds.
       blank: the C MuJoCo model with empty slots.
       robot: the robot's configuration at home, shape (9,).
     """
@@ -142,10 +141,10 @@ class MjxModel:
     def start(self, world: World, cells: Cells) -> tuple[BodyFields, Array, Array]:
         """The model's fields, configurations and commands of worlds at rest with the robot at home."""
         count = len(world.kind)
-        if isinstance(world, CompoundWorld):
-            fields = compound_fields(self.blank, world, cells)
-        else:
+        if world.compounds is None:
             fields = body_fields(self.blank, world.kind, world.half_size, world.valid, cells)
+        else:
+            fields = compound_fields(self.blank, world, cells)
         upright = jnp.where(world.valid[..., None, None], world.rotation, jnp.eye(3)[None, None])
         quaternion = Rotation.from_matrix(upright.reshape(-1, 3, 3)).as_quat()[:, np.array([3, 0, 1, 2])]
         poses = jnp.concatenate([world.position, quaternion.reshape(count, BODIES, 4)], axis=-1)

@@ -35,8 +35,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of
-from mechsearch_jax.envs.simulators.compound_batch import fitting, like_present, room_for
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of, fitting, like_present, room_for
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.simulators.mjx_step import (
     Progress,
@@ -51,7 +50,7 @@ from mechsearch_jax.envs.simulators.mjx_step import (
     verdicts,
     waiting,
 )
-from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
+from mechsearch_jax.envs.simulators.simulator import ROBOT, Flowing, check_actions
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, TrueCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import TARGET, World, alike, from_scenario
@@ -63,18 +62,17 @@ from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
 
-class MjxSimulator:
-    """Many worlds in MuJoCo Warp, a `Simulator`; see the module's description.
+class MjxSimulator(Flowing):
+    """Many worlds in MuJoCo Warp; see the module's description.
 
     The same scenarios and actions always give the same results on a CPU, but not on a GPU.
 
     Attributes:
-      engine: the simulator's name in records.
       shelf, camera, config: as given.
-      world: the present state of all worlds; None before the first `reset`.
     """
 
     engine = "MjxSimulator"
+    takes_cells = True
 
     def __init__(self, shelf: Shelf | None = None, camera: Camera | None = None, config: MjxConfig | None = None):
         """Raises:
@@ -83,7 +81,6 @@ class MjxSimulator:
         self.shelf = shelf or Shelf()
         self.camera = camera or Camera()
         self.config = config or MjxConfig()
-        self.world: World | None = None
         self._fields: BodyFields | None = None
         # Of all worlds now, and of those that begin next.
         self._cells: list[TrueCell] = []
@@ -95,11 +92,6 @@ class MjxSimulator:
         self._adopt(MjxModel(self.shelf, self.camera, self.config))
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
-        """Start episodes, one world for each scenario; see `Simulator.reset`.
-
-        Raises:
-          InputError: there are no scenarios, or more objects in one than slots.
-        """
         if not scenarios:
             raise InputError("MjxSimulator: no scenarios are given; reset it with one for each world")
         worlds = alike([from_scenario(scenario) for scenario in scenarios])
@@ -107,11 +99,6 @@ class MjxSimulator:
         return self.load(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in the given worlds; see `Simulator.replace`.
-
-        Raises:
-          InputError: the simulator was not reset, or there are more objects in a scenario than slots.
-        """
         count = self._count()
         new = jax.tree.map(np.array, self.world)
         for i, scenario in scenarios.items():
@@ -142,11 +129,6 @@ class MjxSimulator:
             self._adopt(MjxModel(self.shelf, self.camera, self.config, room))
 
     def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
-        """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`.
-
-        Raises:
-          InputError: one of them has other physics, or an arm that stops.
-        """
         if any(cell.physics != ASSUMED_CELL.physics for cell in cells.values()):
             raise InputError("MjxSimulator: all worlds have the usual physics; use the NativeSimulator")
         if any(cell.arm_stop for cell in cells.values()):
@@ -154,15 +136,9 @@ class MjxSimulator:
         self._next_cells.update(cells)
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Set the state of all worlds, or of those in `only`; see `Simulator.load`.
-
-        Raises:
-          InputError: `only` is given, but the number of worlds differs from the present one.
-        """
         count = len(world.kind)
-        if only is not None and (self.world is None or len(self.world.kind) != count or len(only) != count):
-            now = 0 if self.world is None else len(self.world.kind)
-            raise InputError(f"MjxSimulator: {count} worlds cannot be set in part: there are {now} now")
+        if only is not None:
+            self._check_part(count, only)
         world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
         if only is None:
             self._use(world)
@@ -183,26 +159,12 @@ class MjxSimulator:
         return now
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Execute an action in every world and let the bodies come to rest; see `Simulator.execute`.
-
-        Raises:
-          InputError: the simulator was not reset, there are not as many actions as worlds, or a kind is unknown.
-        """
         self.begin(actions, active)
         outcome = self._advanced(self._count())[1]
         self._moving[:] = False
         return outcome
 
     def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
-        """Begin actions; worlds that are not active continue.
-
-        Args:
-          actions: of any kinds; fields with a leading axis for the worlds.
-          active: which worlds; all by default. None of them may be moving.
-
-        Raises:
-          InputError: as `execute`, or one of the worlds is moving.
-        """
         count = self._count()
         check_actions(self.engine, actions, count)
         begins = np.ones(count, bool) if active is None else np.array(active)
@@ -215,35 +177,19 @@ class MjxSimulator:
         self._tasks, self._moving = tuple(new), self._moving | begins
 
     def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
-        """Step the moving worlds until more of them are done, and update `world` for these.
-
-        Args:
-          least: least number of worlds that become done; all moving ones if there are fewer.
-
-        Returns:
-          Which worlds became done, and the outcomes of their actions; outcomes of other worlds mean nothing.
-
-        Raises:
-          InputError: the simulator was not reset.
-        """
         self._count()
         done, outcome = jax.device_get(self._advanced(least))
         self._moving = self._moving & ~done
         return done, outcome
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Step with the robot where it is until everything is at rest; see `Simulator.settle`.
-
-        Raises:
-          InputError: the simulator was not reset.
-        """
         active = jnp.ones(self._count(), bool) if active is None else jnp.asarray(active)
         data, self._data = self._data, None
         self._data, self.world, outcome = self._settle(self._fields, data, self.world, None, active)
         return outcome
 
     def programs(self, world: World) -> list[Program]:
-        """All programs that reset, and act in, worlds of these shapes; see `Prepares`."""
+        """All programs that reset, and act in, worlds of these shapes."""
         self._use(world)
         count = len(world.kind)
         mask = jax.ShapeDtypeStruct((count,), bool)
@@ -316,12 +262,6 @@ class MjxSimulator:
     def bytes_per_world(self) -> int:
         """An estimate of a world's device memory [bytes]; see `MjxModel.bytes_per_world`."""
         return self._model.bytes_per_world()
-
-    def _count(self) -> int:
-        """Number of worlds."""
-        if self.world is None:
-            raise InputError("MjxSimulator: reset it before use")
-        return len(self.world.kind)
 
     def _advanced(self, least: int) -> tuple[Array, Outcome]:
         """Which worlds became done, and the outcomes."""

@@ -1,11 +1,11 @@
-"""Protocols, settings and actuator commands that all simulators share."""
+"""What all simulators offer and share: settings, and commands of actuators."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,17 +60,18 @@ class SimulatorConfig:
                 raise InputError(f"SimulatorConfig: {name} {value} must be a positive number")
 
 
-@runtime_checkable
-class Simulator(Protocol):
+class Simulator:
     """W simulated worlds: `NativeSimulator` on a CPU, `MjxSimulator` on a GPU.
 
     Attributes:
       engine: the simulator's name in records.
       world: the present state, its fields with a leading axis W; None before the first `reset` or `load`.
+      takes_cells: whether its worlds may differ from what the planner assumes.
     """
 
     engine: str
-    world: World | None
+    world: World | None = None
+    takes_cells: bool = False
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
         """Start episodes: every body at rest at its pose in the scenario, and the robot at home.
@@ -81,7 +82,7 @@ class Simulator(Protocol):
         Raises:
           InputError: there are no scenarios, or more objects in one than slots.
         """
-        ...
+        raise NotImplementedError
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
         """Start episodes in the given worlds, as `reset` does; the others stay exactly as they are.
@@ -89,7 +90,7 @@ class Simulator(Protocol):
         Raises:
           InputError: it was not reset before, or there are more objects in a scenario than slots.
         """
-        ...
+        raise NotImplementedError
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
         """Set the state of all worlds, or of those in `only`, at rest and with the robot at home.
@@ -101,7 +102,7 @@ class Simulator(Protocol):
         Raises:
           InputError: `only` is given, but the number of worlds differs from the present one.
         """
-        ...
+        raise NotImplementedError
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Execute an action in every active world, let the bodies come to rest, and update `world`.
@@ -113,7 +114,7 @@ class Simulator(Protocol):
         Raises:
           InputError: it was not reset before, there are not as many actions as worlds, or a kind is unknown.
         """
-        ...
+        raise NotImplementedError
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Step with the robot where it is until everything is at rest, for at most `settle_steps`.
@@ -124,46 +125,65 @@ class Simulator(Protocol):
         Raises:
           InputError: it was not reset before.
         """
-        ...
-
-
-@runtime_checkable
-class Flowing(Protocol):
-    """A `Simulator` whose worlds can begin actions while others are still moving."""
-
-    def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
-        """Begin actions in the active worlds, none of which may be moving; the others continue."""
-        ...
-
-    def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
-        """Step the moving worlds until at least `least` of them, or all, are done.
-
-        Returns:
-          Which worlds became done, and the outcomes of their actions; outcomes of other worlds mean nothing.
-        """
-        ...
-
-
-@runtime_checkable
-class TakesCells(Protocol):
-    """A `Simulator` whose worlds may differ from what the planner assumes."""
+        raise NotImplementedError
 
     def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
-        """Set the cells of worlds, by their numbers, for the next episodes that begin in them."""
-        ...
+        """Set the cells of worlds, by their numbers, for the next episodes that begin in them.
 
-
-@runtime_checkable
-class Prepares(Protocol):
-    """An object that can list the programs that it will call, so that they are compiled beforehand."""
+        Raises:
+          InputError: one of them has what this simulator cannot simulate.
+        """
+        raise NotImplementedError
 
     def programs(self, world: World) -> Sequence[Program]:
-        """The programs for these worlds, those that compile longest first.
+        """The programs that it will call for these worlds, so that they are compiled beforehand; longest first.
 
         Args:
           world: of all worlds, or its shapes.
         """
-        ...
+        return []
+
+    def _count(self) -> int:
+        """Number of worlds."""
+        if self.world is None:
+            raise InputError(f"{self.engine}: reset it before use")
+        return len(self.world.kind)
+
+    def _check_part(self, count: int, only: Bool[np.ndarray, " worlds"]) -> None:
+        """Raise InputError unless so many worlds, of which some are to be set, are the present ones."""
+        now = 0 if self.world is None else self._count()
+        if not count == now == len(only):
+            raise InputError(f"{self.engine}: {count} worlds cannot be set in part: there are {now} now")
+
+
+class Flowing(Simulator):
+    """A simulator whose worlds can begin actions while others are still moving."""
+
+    def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
+        """Begin actions; worlds that are not active continue.
+
+        Args:
+          actions: of any kinds; fields with a leading axis for the worlds.
+          active: which worlds; all by default. None of them may be moving.
+
+        Raises:
+          InputError: as `execute`, or one of the worlds is moving.
+        """
+        raise NotImplementedError
+
+    def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
+        """Step the moving worlds until more of them are done, and update `world` for these.
+
+        Args:
+          least: least number of worlds that become done; all moving ones if there are fewer.
+
+        Returns:
+          Which worlds became done, and the outcomes of their actions; outcomes of other worlds mean nothing.
+
+        Raises:
+          InputError: the simulator was not reset.
+        """
+        raise NotImplementedError
 
 
 def check_actions(name: str, actions: Action, worlds: int) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mechsearch_jax.actions import Kind
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.mismatch import TrueCell

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.pushing.physics_push import THINNEST
-from mechsearch_jax.envs.world.compounds import body_at
-from mechsearch_jax.envs.world.world import BODIES, TARGET
+from mechsearch_jax.envs.world.world import BODIES, TARGET, body_at
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
 from mechsearch_jax.shapes import PRIMITIVES, shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents

@@ -33,7 +33,7 @@ from mechsearch_jax.envs.viewer.stage import VISIBLE
 from mechsearch_jax.envs.viewer.viewer import Viewer
 from mechsearch_jax.envs.world.world import TARGET, World, outer_shape, with_target
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner.noted_trials import TriedActions
+from mechsearch_jax.planner.trials import TriedActions
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.session.step import SearchStep
 from mechsearch_jax.shapes import in_order

@@ -51,7 +51,7 @@ class Mismatch:
         factor of its own, between 1 / spread and spread; its logarithm is uniformly distributed. 1: none.
       size_spread: the same of the width, depth and height with which each object is recognised where true shapes are;
         its lowest point stays.
-      physics: contacts and time step of the simulation, one of `simulators.physics.PHYSICS`.
+      physics: contacts and time step of the simulation, one of `simulators.native.PHYSICS`.
       arm_stop: an arm with a joint farther than this from its reference stops and goes back the way it came [rad]; 0:
         it goes on, as trials take it to. Ordinary actions reach 0.027.
       camera_shift, camera_turn: how far the camera stands [m], and how far it is turned about itself [degrees], from

@@ -1,7 +1,9 @@
-"""The true state of the shelf: every body's shape and pose, in fixed slots."""
+"""The true state of the shelf: every body's shape and pose, in fixed slots, and what compounds are made of."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -12,24 +14,203 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
+from scipy.spatial import HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.world.compounds import Compounds, body_at, body_of, compounds_of, with_polyhedra
 from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.identity import Uncompared
-from mechsearch_jax.shapes import Shape, in_order, shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, Compound, half_extents
-from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
+from mechsearch_jax.shapes import PRIMITIVES, Shape, in_order, shape_of
+from mechsearch_jax.shapes.compound import (
+    COMPOUND,
+    CONVEX,
+    CONVEX_CODE,
+    MOST_SOLIDS,
+    MOST_VERTICES,
+    Compound,
+    Piece,
+    faces,
+    half_extents,
+    inertial,
+    solids,
+)
+from mechsearch_jax.shapes.parts import part_rows
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, pieces_of, rotation_matrix
 from mechsearch_jax.workspace.target import Target
 
+# Most faces of a convex polyhedron: triangles between its vertices.
+FACES = 2 * MOST_VERTICES - 4
+# What fills unused rows of arrays [m].
+_NOTHING = 1e-3
 TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
 # A target that leans further than this has fallen over [rad].
 MAX_TILT = math.radians(15)
-# Steps of `TargetCompoundWorld.room` [m].
+# Steps of `CompoundTarget.room` [m].
 ROOM = 0.02
+
+
+class Solids(flax.struct.PyTreeNode):
+    """The solids of bodies, in the bodies' frames; leading axes (..., 9, 16).
+
+    Attributes:
+      kind: code of a primitive, or `CONVEX_CODE`, int32.
+      half_size: half-extents along a primitive's axes [m], shape (..., 9, 16, 3).
+      position: of the centre [m], shape (..., 9, 16, 3).
+      rotation: `R_body_solid`, shape (..., 9, 16, 3, 3).
+      faces: half-spaces of a convex polyhedron, rows (n, d) with n . x <= d in its frame; none in a world without
+        such, shape (..., 9, 16, F, 4).
+      valid: whether the row holds a solid.
+    """
+
+    kind: jax.Array
+    half_size: jax.Array
+    position: jax.Array
+    rotation: jax.Array
+    faces: jax.Array
+    valid: jax.Array
+
+
+class Matter(flax.struct.PyTreeNode):
+    """What bodies are made of; leading axes (..., 9).
+
+    Attributes:
+      mass: [kg].
+      moments: principal moments of inertia [kg m2], shape (..., 9, 3).
+      axes: rotation of the principal axes in the body's frame, shape (..., 9, 3, 3).
+      friction: coefficient of sliding friction.
+      density: [kg/m3].
+      colour: red, green and blue, 0 to 1; NaN where the colour is the slot's, shape (..., 9, 3).
+    """
+
+    mass: jax.Array
+    moments: jax.Array
+    axes: jax.Array
+    friction: jax.Array
+    density: jax.Array
+    colour: jax.Array
+
+
+class Compounds(flax.struct.PyTreeNode):
+    """What a `World` of compounds knows beside a plain one.
+
+    Attributes:
+      compound: which bodies are compounds, shape (..., 9); the others have a single solid.
+      solids: of all bodies.
+      matter: of all bodies.
+      parts: the superquadrics that describe each body to the planner, in its frame, leading axes (..., 9, 4).
+    """
+
+    compound: jax.Array
+    solids: Solids
+    matter: Matter
+    parts: Superquadrics
+
+
+def compounds_of(bodies: Sequence[Body | None]) -> Compounds:
+    """What the bodies in a world's slots are made of.
+
+    Args:
+      bodies: in their slots; None for an empty one.
+
+    Raises:
+      InputError: a plain body is of a shape that is no primitive.
+    """
+    made = [None if body is None else pieces_of(body) for body in bodies]
+    wide = any(piece.shape == CONVEX for one in made if one for piece in one.pieces)
+    rows = [_body_solids(one, FACES if wide else 0) for one in made]
+    return Compounds(
+        compound=jax.device_put(np.array([body is not None and body.compound is not None for body in bodies])),
+        solids=_stacked(rows),
+        matter=_stacked([_matter(one) for one in made]),
+        parts=_stacked([_parts(one) for one in made]),
+    )
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *trees)
+
+
+@functools.lru_cache(maxsize=1024)
+def _body_solids(compound: Compound | None, sides: int) -> Any:
+    """The rows of a body's solids, as a `Solids` of NumPy arrays, which must not be changed."""
+    rows = [] if compound is None else solids(compound.pieces)
+    half = np.full((MOST_SOLIDS, 3), _NOTHING, np.float32)
+    kind, position = np.zeros(MOST_SOLIDS, np.int32), np.zeros((MOST_SOLIDS, 3), np.float32)
+    rotation = np.tile(np.eye(3, dtype=np.float32), (MOST_SOLIDS, 1, 1))
+    planes = np.zeros((MOST_SOLIDS, sides, 4), np.float32)
+    for i, solid in enumerate(rows):
+        position[i], rotation[i] = solid.position, solid.rotation
+        if solid.shape == CONVEX:
+            own = faces(solid)
+            kind[i], half[i] = CONVEX_CODE, np.abs(np.array(solid.vertices)).max(axis=0)
+            planes[i] = own[np.minimum(np.arange(sides), len(own) - 1)]
+        else:
+            kind[i], half[i] = PRIMITIVES[solid.shape].code, solid.half_size
+    return Solids(kind, half, position, rotation, planes, np.arange(MOST_SOLIDS) < len(rows))  # pyright: ignore
+
+
+@functools.lru_cache(maxsize=1024)
+def _matter(compound: Compound | None) -> Any:
+    if compound is None:
+        numbers = (_NOTHING, [_NOTHING] * 3, np.eye(3), 0.0, 1.0, [np.nan] * 3)
+    else:
+        weight, colour = inertial(compound), compound.colour or [np.nan] * 3
+        numbers = (weight.mass, weight.moments, weight.rotation, compound.friction, compound.density, colour)
+    return Matter(*(np.asarray(value, np.float32) for value in numbers))  # pyright: ignore[reportArgumentType]
+
+
+@functools.lru_cache(maxsize=1024)
+def _parts(compound: Compound | None) -> Any:
+    return Superquadrics(*part_rows(compound))  # pyright: ignore[reportArgumentType]
+
+
+def body_of(host: Compounds, slot: int, pose: tuple[Sequence[float], Sequence[float]]) -> Body:
+    """A compound in a slot, made again of what a world knows of it.
+
+    Frustums come back as their discs.
+
+    Args:
+      host: as NumPy arrays, without further leading axes.
+      slot: of a compound.
+      pose: position [m] and quaternion (w, x, y, z).
+    """
+    rows: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[slot], host.solids)
+    pieces = tuple(_piece(jax.tree.map(lambda leaf, i=i: leaf[i], rows)) for i in np.flatnonzero(rows.valid))
+    matter: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[slot], host.matter)
+    colour = None if np.isnan(matter.colour).any() else tuple(float(c) for c in matter.colour)
+    compound = Compound(pieces, float(matter.density), float(matter.friction), colour)  # pyright: ignore
+    return body_at(compound, pose)
+
+
+def body_at(compound: Compound, pose: tuple[Sequence[float], Sequence[float]]) -> Body:
+    """The body of a compound at a pose: position [m] and quaternion (w, x, y, z)."""
+    position, quaternion = (tuple(float(v) for v in values) for values in pose)
+    return Body(COMPOUND, half_extents(compound), position, quaternion, compound)  # pyright: ignore
+
+
+def _piece(row: Any) -> Piece:
+    """The piece of a single row of `Solids`."""
+    quaternion = tuple(Rotation.from_matrix(row.rotation).as_quat(scalar_first=True).tolist())
+    position = tuple(row.position.tolist())
+    if row.kind != CONVEX_CODE:
+        name = list(PRIMITIVES)[row.kind]
+        return Piece(name, tuple(row.half_size.tolist()), position, quaternion)
+    halves = np.column_stack([row.faces[:, :3], -row.faces[:, 3]]).astype(float)
+    corners: Float[np.ndarray, "n 3"] = np.unique(
+        np.round(HalfspaceIntersection(halves, np.zeros(3)).intersections, 7), axis=0
+    )
+    vertices = tuple((x, y, z) for x, y, z in corners.tolist())
+    return Piece(CONVEX, (0.0, 0.0, 0.0), position, quaternion, vertices)
+
+
+def with_polyhedra(compounds: Compounds) -> Compounds:
+    """The same with room for convex polyhedra, so that worlds with and without such can be stacked."""
+    shape = compounds.solids.faces.shape
+    if shape[-2]:
+        return compounds
+    room = jax.device_put(np.zeros((*shape[:-2], FACES, 4), np.float32))
+    return dataclasses.replace(compounds, solids=dataclasses.replace(compounds.solids, faces=room))
 
 
 def fallen_over(rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True) -> bool:
@@ -38,15 +219,31 @@ def fallen_over(rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True) -> 
     return bool(upright < math.cos(MAX_TILT))
 
 
-class World(flax.struct.PyTreeNode):
-    """All bodies on the shelf. Every field has the leading axes (..., 9): eight slots for objects, then the target.
+@dataclasses.dataclass(frozen=True)
+class CompoundTarget:
+    """A target that is a compound, as a world knows it; equal for targets with the same room.
 
     Attributes:
-      kind: code of the body's shape (`shapes.Shape`), int32.
-      half_size: half-extents along the body's own axes [m], shape (..., 9, 3).
+      room: half-extents of a box that has room for it, in steps of `ROOM` [m].
+      made_of: the target; no program depends on it, and it is not for use inside of one.
+    """
+
+    room: tuple[float, float, float]
+    made_of: Compound = dataclasses.field(compare=False)
+
+
+class World(flax.struct.PyTreeNode):
+    """All bodies on the shelf. Arrays have the leading axes (..., 9): eight slots for objects, then the target.
+
+    Attributes:
+      kind: code of the body's shape (`shapes.Shape`), int32; of a compound that of the box around it.
+      half_size: half-extents along the body's own axes [m], shape (..., 9, 3); of a compound those of the box about its
+        centre of mass that contains it.
       position: `t_world_body` [m], shape (..., 9, 3).
       rotation: `R_world_body`, shape (..., 9, 3, 3).
       valid: whether the slot holds a body.
+      compounds: what the bodies are made of; None if none is a compound, so that programs stay what they are.
+      target: a target that is a compound, else None. Static: worlds side by side have the same.
     """
 
     kind: jax.Array
@@ -54,35 +251,8 @@ class World(flax.struct.PyTreeNode):
     position: jax.Array
     rotation: jax.Array
     valid: jax.Array
-
-
-class CompoundWorld(World):
-    """A world of which some bodies are compounds; see `World`.
-
-    Kind and half size of a compound are those of the box about its centre of mass that contains it.
-
-    Attributes:
-      compounds: what the bodies are made of.
-    """
-
-    compounds: Compounds
-
-
-class TargetCompoundWorld(CompoundWorld):
-    """A world whose target is a compound; see `CompoundWorld`.
-
-    Attributes:
-      made_of: the target. Static: worlds side by side have the same; but programs do not depend on it.
-      room: half-extents of a box that has room for it, in steps of `ROOM` [m]; static.
-    """
-
-    made_of: Uncompared[Compound] = flax.struct.field(pytree_node=False)
-    room: tuple[float, float, float] = flax.struct.field(pytree_node=False)
-
-    @property
-    def target(self) -> Compound:
-        """What the target is made of; not for use inside of a program."""
-        return self.made_of.value
+    compounds: Compounds | None = None
+    target: CompoundTarget | None = flax.struct.field(pytree_node=False, default=None)
 
 
 def slots(scenario: Scenario) -> list[Body | None]:
@@ -98,7 +268,7 @@ def slots(scenario: Scenario) -> list[Body | None]:
 
 
 def from_scenario(scenario: Scenario) -> World:
-    """The world of a scenario: a `CompoundWorld` if it has compounds, a `TargetCompoundWorld` if the target is one.
+    """The world of a scenario.
 
     Raises:
       InputError: there are more objects than slots, or a shape that cannot stand beside compounds.
@@ -118,13 +288,13 @@ def from_scenario(scenario: Scenario) -> World:
     return _of_compounds(world, bodies)
 
 
-def _of_compounds(world: World, bodies: Sequence[Body | None]) -> CompoundWorld:
+def _of_compounds(world: World, bodies: Sequence[Body | None]) -> World:
     """A plain world as one of the compounds that the bodies in its slots are."""
-    fields, target = {**_fields(world), "compounds": compounds_of(bodies)}, bodies[TARGET]
+    world, target = world.replace(compounds=compounds_of(bodies)), bodies[TARGET]
     if target is None or target.compound is None:
-        return CompoundWorld(**fields)
+        return world
     x, y, z = (round(math.ceil(half / ROOM - 1e-6) * ROOM, 3) for half in half_extents(target.compound))
-    return TargetCompoundWorld(**fields, made_of=Uncompared(target.compound), room=(x, y, z))
+    return world.replace(target=CompoundTarget((x, y, z), target.compound))
 
 
 def with_target(world: World, target: Target) -> World:
@@ -134,7 +304,7 @@ def with_target(world: World, target: Target) -> World:
       world: fields without further leading axes.
       target: of the search.
     """
-    if target.compound is None or isinstance(world, TargetCompoundWorld):
+    if target.compound is None or world.target is not None:
         return world
     bodies = bodies_of(world)
     bodies[TARGET] = Body(COMPOUND, target.half_size, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), target.compound)
@@ -146,10 +316,6 @@ def outer_shape(body: Body | Target) -> Shape:
     return in_order()[0] if body.shape == COMPOUND else shape_of(body.shape)
 
 
-def _fields(world: World) -> dict[str, Any]:
-    return {name: getattr(world, name) for name in World.__dataclass_fields__}
-
-
 def alike(worlds: Sequence[World]) -> list[World]:
     """The worlds with the same leaves, so that they can be stacked: all of compounds if one is.
 
@@ -159,16 +325,17 @@ def alike(worlds: Sequence[World]) -> list[World]:
     Raises:
       InputError: a body has a shape that cannot stand beside compounds.
     """
-    if not any(isinstance(world, CompoundWorld) for world in worlds):
+    if all(world.compounds is None for world in worlds):
         return list(worlds)
     made = [as_compounds(world) for world in worlds]
-    if any(world.compounds.solids.faces.shape[-2] for world in made):
-        return [world.replace(compounds=with_polyhedra(world.compounds)) for world in made]
-    return [*made]
+    of_all = [world.compounds for world in made if world.compounds is not None]
+    if any(compounds.solids.faces.shape[-2] for compounds in of_all):
+        return [world.replace(compounds=with_polyhedra(own)) for world, own in zip(made, of_all, strict=True)]
+    return made
 
 
-def as_compounds(world: World) -> CompoundWorld:
-    """A world as one of compounds; a plain body is a single solid.
+def as_compounds(world: World) -> World:
+    """A world that has `compounds`; a plain body is a single solid.
 
     Args:
       world: fields without further leading axes.
@@ -176,9 +343,7 @@ def as_compounds(world: World) -> CompoundWorld:
     Raises:
       InputError: a body has a shape that cannot stand beside compounds.
     """
-    if isinstance(world, CompoundWorld):
-        return world
-    return _of_compounds(world, bodies_of(world))
+    return world if world.compounds is not None else _of_compounds(world, bodies_of(world))
 
 
 def bodies_of(world: World) -> list[Body | None]:
@@ -190,14 +355,13 @@ def bodies_of(world: World) -> list[Body | None]:
     host = jax.device_get(world)
     quaternions = Rotation.from_matrix(np.where(host.valid[:, None, None], host.rotation, np.eye(3))).as_quat()
     quaternions = quaternions[:, [3, 0, 1, 2]]
-    made = host.compounds if isinstance(host, CompoundWorld) else None
 
     def body(i: int) -> Body:
         pose = host.position[i].tolist(), quaternions[i].tolist()
-        if i == TARGET and isinstance(host, TargetCompoundWorld):
-            return body_at(host.target, pose)
-        if made is not None and made.compound[i]:
-            return body_of(made, i, pose)
+        if i == TARGET and host.target is not None:
+            return body_at(host.target.made_of, pose)
+        if host.compounds is not None and host.compounds.compound[i]:
+            return body_of(host.compounds, i, pose)
         return Body(
             in_order()[host.kind[i]].name,
             *(tuple(float(v) for v in values) for values in (host.half_size[i], host.position[i])),  # pyright: ignore
@@ -209,7 +373,7 @@ def bodies_of(world: World) -> list[Body | None]:
 
 def superquadrics(world: World) -> Superquadrics:
     """The true superquadrics of all bodies, the target last; of a world with compounds bodies of several parts."""
-    if isinstance(world, CompoundWorld):
+    if world.compounds is not None:
         scene = of_parts(world.compounds.parts, world.position, world.rotation)
         return scene.replace(valid=scene.valid & world.valid)
     exponents = jnp.array([shape.exponents for shape in in_order()])
@@ -222,10 +386,10 @@ def plain_objects(world: World) -> World:
     Objects of a plain world are superquadrics without parts, with which all of a planner's programs are half as large.
     Inside of programs, where it is not known which bodies are compounds, the world stays as it is.
     """
-    if not isinstance(world, CompoundWorld) or isinstance(world.compounds.compound, Tracer):
+    if world.compounds is None or isinstance(world.compounds.compound, Tracer):
         return world
     objects = np.asarray(world.compounds.compound)[..., :TARGET]
-    return world if objects.any() else World(**_fields(world))
+    return world if objects.any() else world.replace(compounds=None, target=None)
 
 
 def true_superquadrics(world: World) -> Superquadrics:

@@ -1,13 +1,17 @@
 """What the robot can do: one file for each kind of action, their registry, and how they are sampled."""
 
-from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, free_candidates, no_candidates
+from mechsearch_jax.actions.candidates import (
+    AllCandidates,
+    all_candidates,
+    free_candidates,
+    no_candidates,
+    sample_action,
+)
 from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables, action_tables
-from mechsearch_jax.actions.kind import Kind, SampledKind
+from mechsearch_jax.actions.kind import Kind, SampledKind, Sketch
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.actions.registry import KINDS, SAMPLED_KINDS, ActionKind, kind_of
-from mechsearch_jax.actions.sampler import sample_action
-from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
 from mechsearch_jax.actions.types import Action, Candidates, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen

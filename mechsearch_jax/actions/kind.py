@@ -1,16 +1,15 @@
-"""The protocol that every kind of action implements, one file each; `registry` lists them."""
+"""What every kind of action offers, one file each; `registry` lists them."""
 
 from __future__ import annotations
 
-from typing import Protocol
+import dataclasses
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.config import ActionSpace
-from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
+from mechsearch_jax.actions.types import Action, Candidates, DrawnCandidate, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.footprints import Footprints
@@ -18,7 +17,24 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 
 
-class Kind(Protocol):
+@dataclasses.dataclass(frozen=True)
+class Sketch:
+    """Lines in the world; every part may be missing.
+
+    Attributes:
+      hands: poses of the gripper, first where the action begins, shape (k, 4, 4) [m].
+      opening: distance between its fingers [m].
+      path: path of the hand or of the object in it, drawn as an arrow, shape (points, 3) [m].
+      takes_target: whether the target moves along the path.
+    """
+
+    hands: Float[np.ndarray, "k 4 4"] | None = None
+    opening: float = 0.0
+    path: Float[np.ndarray, "points 3"] | None = None
+    takes_target: bool = False
+
+
+class Kind:
     """A kind of action.
 
     Attributes:
@@ -30,18 +46,12 @@ class Kind(Protocol):
       returns_home: whether the robot is back in its home configuration afterwards.
     """
 
-    @property
-    def code(self) -> int: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def moves_object(self) -> bool: ...
-    @property
-    def holds_object(self) -> bool: ...
-    @property
-    def takes_target(self) -> bool: ...
-    @property
-    def returns_home(self) -> bool: ...
+    code: int
+    name: str
+    moves_object: bool = False
+    holds_object: bool = False
+    takes_target: bool = False
+    returns_home: bool = False
 
     def predict(
         self,
@@ -62,15 +72,15 @@ class Kind(Protocol):
           action: a single action.
           wrist: index of its wrist angle.
         """
-        ...
+        raise NotImplementedError
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
         """The motion of arm and fingers, and whether the arm reaches all of it; None for a kind without motion."""
-        ...
+        return None
 
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
         """What a picture shows of an action, from the objects before it and those predicted after it."""
-        ...
+        raise NotImplementedError
 
     def describe(self, action: Action, target: int | None = None) -> str:
         """A single action in words, with directions as seen by the robot.
@@ -79,10 +89,10 @@ class Kind(Protocol):
           action: of this kind.
           target: the object index that stands for the target; None if there is none.
         """
-        ...
+        raise NotImplementedError
 
 
-class SampledKind(Kind, Protocol):
+class SampledKind(Kind):
     """A kind of action that moves an object and from which sequences are sampled.
 
     Every object has V x D candidates: V gripper poses, each with D distances.
@@ -93,26 +103,23 @@ class SampledKind(Kind, Protocol):
       moves_target: whether it may move a found target.
     """
 
-    @property
-    def opening(self) -> int: ...
-    @property
-    def surrounds_object(self) -> bool: ...
-    @property
-    def moves_target(self) -> bool: ...
+    opening: int
+    surrounds_object: bool
+    moves_target: bool
 
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
         """Index of the wrist angle of each gripper pose."""
-        ...
+        raise NotImplementedError
 
     def distances(self, space: ActionSpace) -> int:
         """The number of distances D."""
-        ...
+        raise NotImplementedError
 
     def propose(
         self, space: ActionSpace, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
     ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
         """Gripper poses of all candidates, and their `Candidates.weight`; only those of `fresh` objects are used."""
-        ...
+        raise NotImplementedError
 
     def travels(self, space: ActionSpace, T: Float[Array, "k 4 4"], near: Bool[Array, " k"]) -> Bool[Array, "k d"]:
         """Whether arm and shelf allow the motion after the approach; K = N V gripper poses.
@@ -122,19 +129,19 @@ class SampledKind(Kind, Protocol):
           T: gripper poses, object by object.
           near: whether the arm can approach each pose; the result is False elsewhere.
         """
-        ...
+        raise NotImplementedError
 
     def swept_hits(
         self, space: ActionSpace, scene: Superquadrics, T: Float[Array, "k 4 4"], mask: Bool[Array, "k n"]
     ) -> Bool[Array, "k n"]:
         """Which objects the grasped object hits on its way out, where the mask is true."""
-        ...
+        raise NotImplementedError
 
     def entering(
         self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates
     ) -> Bool[Array, "n v d"]:
         """Which candidates enter space where the target may be; tested only for candidates that hit nothing."""
-        ...
+        raise NotImplementedError
 
     def draft(
         self,
@@ -144,6 +151,6 @@ class SampledKind(Kind, Protocol):
         possible: PossibleSpace,
         candidates: Candidates,
         drawn: DrawnCandidate,
-    ) -> Draft:
-        """The action of a drawn candidate, whose number may be out of range if it is not `wanted`."""
-        ...
+    ) -> tuple[Bool[Array, ""], Sample]:
+        """Whether a drawn candidate can be executed, and its action; its number may be out of range if not `wanted`."""
+        raise NotImplementedError

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.compound_grasps import grip_between
 from mechsearch_jax.geometry.bodies import grasped_shape
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
@@ -31,6 +30,7 @@ from mechsearch_jax.robot.hand import (
 )
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
+from mechsearch_jax.robot.pads import grip_between
 from mechsearch_jax.robot.robot_trajectory import derivatives
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError

@@ -64,21 +64,6 @@ class DrawnCandidate(NamedTuple):
     wanted: Bool[Array, ""]
 
 
-class Draft(flax.struct.PyTreeNode):
-    """The action that a kind makes of a drawn candidate.
-
-    Attributes:
-      possible: whether it can be executed.
-      action, wrist, grippers, bodies: as in `Sample`.
-    """
-
-    possible: jax.Array
-    action: Action
-    wrist: jax.Array
-    grippers: jax.Array
-    bodies: jax.Array
-
-
 class Prediction(flax.struct.PyTreeNode):
     """Predicted effect of an action.
 

@@ -19,11 +19,11 @@ from mechsearch_jax.existence import allowances, closer_image, free, object_view
 from mechsearch_jax.geometry.bodies import with_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import grasp_hits, graspability, pairs
+from mechsearch_jax.grasping.graspability import grasp_hits, graspability, pairs
+from mechsearch_jax.grasping.retrieval import FoundGrasps, found_grasps, no_grasps
 from mechsearch_jax.images.measured import sampled
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.retrieval import FoundGrasps, found_grasps, no_grasps
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.render import merge_windows

@@ -53,7 +53,7 @@ class GivenTarget:
             return self.target
         if self.target is not None:
             raise InputError("give either --target or --target-file, not both")
-        from mechsearch_jax.workspace.target_file import load_target
+        from mechsearch_jax.workspace.target import load_target
 
         return load_target(self.target_file, 1.0 if self.target_scale is None else self.target_scale)
 

@@ -114,7 +114,7 @@ def check(scenarios: Scenarios, /, *, config: ConfigFile = None) -> None:
       config: a file of settings, of which the shelf counts.
     """
     from mechsearch_jax.envs.scenes.standing import faults
-    from mechsearch_jax.envs.simulators.native_world import NativeWorld
+    from mechsearch_jax.envs.simulators.native import NativeWorld
     from mechsearch_jax.workspace.scenario import load_scenario
     from mechsearch_jax.workspace.shelf import Shelf
 

@@ -18,7 +18,7 @@ from mechsearch_jax.actions.config import ActionConfig
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
-from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 

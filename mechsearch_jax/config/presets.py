@@ -11,7 +11,7 @@ from mechsearch_jax.actions.config import ActionConfig
 from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
 from mechsearch_jax.config.config import Config, PlannerConfig, ProblemConfig
 from mechsearch_jax.existence import ExistenceConfig
-from mechsearch_jax.grasp_config import GraspConfig
+from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
 
 

@@ -16,12 +16,12 @@ from mechsearch_jax.geometry.spreading import farthest_points
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
 
 Kind = Literal["box", "capsule"]
-# A box or a capsule: its kind, its size [m] and the bytes of its pose, as of a `gripper.Primitive`.
-Solid = tuple[Kind, tuple[float, ...], bytes]
+# A box or a capsule: its kind, its size [m] and the bytes of its pose, as of a `gripper.RobotPart`.
+SolidKey = tuple[Kind, tuple[float, ...], bytes]
 
 
 def cloud_of(
-    solids: tuple[Solid, ...], front: float, fine: float, count: int, distance: float, seed: int
+    solids: tuple[SolidKey, ...], front: float, fine: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
     """The points, float32 [m]; kept on disk, see `runtime.kept_arrays`.
 
@@ -40,7 +40,7 @@ def cloud_of(
 
 
 def _cloud(
-    solids: tuple[Solid, ...], front: float, fine: float, count: int, distance: float, seed: int
+    solids: tuple[SolidKey, ...], front: float, fine: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
     hulls = [_swept_hull(*solid, distance) for solid in solids]
     areas = np.array([hull.mesh.area for hull in hulls])

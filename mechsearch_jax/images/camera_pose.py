@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry.transforms import compose, exponential, inverse, make, matmul, rotate, transform
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, RobotPart
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 
@@ -52,7 +52,7 @@ def _solids() -> _Solids:
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     lifted = np.eye(4)
     lifted[2, 3] = FINGER_BASE
-    parts: list[tuple[int, np.ndarray, Primitive, float]] = [
+    parts: list[tuple[int, np.ndarray, RobotPart, float]] = [
         (i, np.eye(4), primitive, 0.0) for i, link in enumerate(LINKS) for primitive in link
     ]
     parts += [(HAND_FRAME, np.eye(4), primitive, 0.0) for primitive in HAND]

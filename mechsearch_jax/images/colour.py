@@ -177,7 +177,7 @@ def rgb_of_hue(hue: float, saturation: float) -> tuple[float, float, float]:
     return colorsys.hsv_to_rgb(hue / 360.0, saturation, 1.0)
 
 
-class Detection(flax.struct.PyTreeNode):
+class ColourDetection(flax.struct.PyTreeNode):
     """Which segment is the target.
 
     Attributes:
@@ -194,7 +194,7 @@ class Detection(flax.struct.PyTreeNode):
 @functools.partial(jax.jit, static_argnames=("segments", "target"))
 def detect_target(
     colours: Float[Array, "p 3"], labels: Int[Array, " p"], segments: int, target: TargetColour | None = None
-) -> Detection:
+) -> ColourDetection:
     """Find the target among segments by their mean colours (appendix C.3).
 
     Args:
@@ -210,7 +210,7 @@ def detect_target(
     difference = target.difference(mean, jnp.array(target.rgb))
     difference = jnp.where(count >= target.minimum_pixels, difference, jnp.inf)
     is_like_target = difference < target.threshold
-    return Detection(jnp.sum(is_like_target) == 1, jnp.argmin(difference).astype(jnp.int32), difference)
+    return ColourDetection(jnp.sum(is_like_target) == 1, jnp.argmin(difference).astype(jnp.int32), difference)
 
 
 @dataclasses.dataclass(frozen=True)

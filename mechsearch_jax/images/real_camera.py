@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.camera_pose import PoseConfig, PoseEstimate, estimate_pose
-from mechsearch_jax.images.checks.usable import check_images
-from mechsearch_jax.images.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
+from mechsearch_jax.images.checks import check_images
+from mechsearch_jax.images.colour import ClusterConfig, ColourDetection, TargetColour, cluster_by_colour, detect_target
+from mechsearch_jax.images.detection import evened
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
-from mechsearch_jax.images.target_pixels import evened
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf
@@ -93,7 +93,7 @@ class PreparedImage(flax.struct.PyTreeNode):
 
     segmentation: jax.Array
     depth: jax.Array
-    detection: Detection
+    detection: ColourDetection
     floor: Plane
     pose: PoseEstimate | None
     camera: Camera = flax.struct.field(pytree_node=False)

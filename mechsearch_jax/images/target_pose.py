@@ -1,15 +1,21 @@
-"""The pose of a target of known shape from its visible points."""
+"""The pose of a target of known shape from its visible points, and what the pixels of an image say for and against it,
+upright or not.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.geometry.transforms import exponential, matmul, yaw_rotation
+from mechsearch_jax.shapes.solid import Solid
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -19,6 +25,20 @@ OUTLIER = 0.003
 # Damping of a step, relative to the normal equations' diagonal, and the longest step [m, m, rad].
 DAMPING = 1e-3
 LONGEST_STEP = (0.01, 0.01, 0.3)
+# Points within so many standard deviations of the depth's noise of the target's surface are on it, but not nearer or
+# farther than these distances [m].
+DEVIATIONS, LEAST_TOLERANCE, LARGEST_TOLERANCE = 4.0, 0.003, 0.008
+# Points of the target's colour up to this far from its surface belong to a larger thing, if they are not on it [m].
+BEYOND = 0.03
+# The target's outline is known to this distance, for its pose is not exact [m].
+OUTLINE = 0.003
+# How far the target may seem to be inside of a face of the shelf [m].
+INTO_SHELF = 0.01
+# Where the axis of an upright target may be from the middle of its visible part, across the view and away from the
+# camera, in radii: in the middle of it, or to a side where the rest is hidden.
+STARTS = ((0.0, 0.65), (-0.8, 0.5), (0.8, 0.5))
+# Longest step of a pose with all its degrees of freedom: position [m] and rotation vector [rad].
+LONGEST_FREE_STEP = (LONGEST_STEP[0],) * 3 + (LONGEST_STEP[2],) * 3
 
 
 def distance(target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "p 3"]) -> Float[Array, " p"]:
@@ -119,3 +139,170 @@ def target_poses(
     poses, costs = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
     turned = jnp.zeros_like(costs) if target.solid.round else jnp.mod(poses[:, 2], target.turn)
     return poses.at[:, 2].set(turned), costs
+
+
+class Placement(flax.struct.PyTreeNode):
+    """A pose of the target in the world: `R_world_target`, shape (..., 3, 3), and its centre [m], shape (..., 3)."""
+
+    rotation: jax.Array
+    centre: jax.Array
+
+
+class SampledPixels(flax.struct.PyTreeNode):
+    """N pixels of an image.
+
+    Attributes:
+      rays: directions in the world, scaled to unit depth, shape (N, 3).
+      points: in the world [m], shape (N, 3); NaN where nothing was measured.
+      depth: of the points [m], shape (N,); infinite where there is nothing.
+      coloured: whether they have the target's colour, shape (N,).
+      tolerance: distance from a surface within which points are on it [m], shape (N,).
+    """
+
+    rays: jax.Array
+    points: jax.Array
+    depth: jax.Array
+    coloured: jax.Array
+    tolerance: jax.Array
+
+
+class Evidence(flax.struct.PyTreeNode):
+    """The numbers of pixels that speak for and against a placement."""
+
+    support: jax.Array
+    contrary: jax.Array
+
+    @property
+    def share(self) -> Array:
+        """The share of support, 0 without any."""
+        return self.support / jnp.maximum(self.support + self.contrary, 1)
+
+
+def upright(target: Target, shelf: Shelf, pose: Float[Array, " 3"]) -> Placement:
+    """The placement of a target that stands on the board at x, y [m] and yaw [rad]."""
+    return Placement(yaw_rotation(pose[2]), jnp.stack([pose[0], pose[1], jnp.asarray(target.height(shelf))]))
+
+
+def away_from(target: Target, placement: Placement, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Signed distance [m] of world points to the surface of the target; NaN for NaN."""
+    body = matmul(points - placement.centre[None], placement.rotation)
+    return target.solid.distance(body[:, :2], body[:, 2], jnp)
+
+
+def evidence(target: Target, placement: Placement, origin: Float[Array, " 3"], sample: SampledPixels) -> Evidence:
+    """What pixels say for and against a placement.
+
+    For it are pixels of the target's colour on its surface. Against it are pixels in its outline that show something
+    behind it, or something of its colour before it, and pixels of its colour next to it that are not on its surface or
+    outside of its outline, for then it is a part of something larger. What is hidden by things of other colours counts
+    for nothing.
+
+    Args:
+      target: whose shape and size are known; static.
+      placement: of the target.
+      origin: the camera's position in the world [m].
+      sample: of the image.
+    """
+    away = jnp.abs(away_from(target, placement, sample.points))
+    start, along = (matmul(a, placement.rotation) for a in ((origin - placement.centre)[None], sample.rays))
+    start, along = ([a[..., i] for i in range(3)] for a in (start, along))
+    surface = target.solid.cut(start, along, -OUTLINE, jnp)
+    outline = target.solid.cut(start, along, OUTLINE, jnp)
+    on_it, inside = away < sample.tolerance, jnp.isfinite(surface)
+    through = inside & ~on_it & (sample.depth > surface + sample.tolerance)
+    before = inside & ~on_it & (sample.depth < surface)
+    like_it = sample.coloured & on_it & jnp.isfinite(outline)
+    larger = sample.coloured & ~like_it & (before | (away < BEYOND))
+    return Evidence(jnp.sum(like_it), jnp.sum(through | larger))
+
+
+def within_shelf(target: Target, placement: Placement, shelf: Shelf) -> Bool[Array, ""]:
+    """Whether a target is inside of the shelf, or open before it, but for `INTO_SHELF`."""
+    against, along = target.solid.extent(placement.rotation, jnp)
+    low, high = placement.centre - against, placement.centre + along
+    faces = (low[2] - shelf.board, low[1] - shelf.right, shelf.left - high[1], shelf.back - high[0])
+    return jnp.all(jnp.stack([jnp.asarray(face) for face in faces]) > -INTO_SHELF)
+
+
+def depth_tolerance(depth: Float[Array, "h w"], chosen: Bool[Array, "h w"]) -> Float[Array, ""]:
+    """Distance from a surface within which points are on it [m], by the depth's noise in the chosen pixels.
+
+    The noise is the median size of the second differences along rows, which surfaces hardly have.
+    """
+    second = depth[:, 2:] - 2.0 * depth[:, 1:-1] + depth[:, :-2]
+    size = jnp.where(chosen[:, 1:-1] & jnp.isfinite(second), jnp.abs(second), jnp.nan)
+    # Half of all normal numbers of deviation 1 are below 0.6745; second differences have 6 times the variance.
+    deviation = jnp.nanmedian(size) / (0.6745 * math.sqrt(6.0))
+    tolerance = jnp.clip(DEVIATIONS * deviation, LEAST_TOLERANCE, LARGEST_TOLERANCE)
+    return jnp.where(jnp.isnan(tolerance), LARGEST_TOLERANCE, tolerance)
+
+
+def upright_placements(
+    target: Target, shelf: Shelf, origin: Float[Array, " 3"], points: Float[Array, "p 3"], valid: Bool[Array, " p"]
+) -> Placement:
+    """Placements of an upright target that fit points on its visible side, with a leading axis.
+
+    Args:
+      target: static.
+      shelf: on which it stands.
+      origin: the camera's position in the world [m].
+      points: in the world [m].
+      valid: which of them are to be on the target's surface.
+    """
+    weight, points, middle, outwards = _visible_side(origin, points, valid)
+    level = jnp.stack([jnp.stack([-outwards[1], outwards[0]]), outwards[:2]])
+    xy = middle[None, :2] + target.solid.breadth * matmul(jnp.array(STARTS), level)
+    yaws = start_yaws(target, 4)
+    starts = jnp.concatenate([jnp.repeat(xy, len(yaws), axis=0), jnp.tile(yaws, len(STARTS))[:, None]], axis=1)
+    residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
+    poses, _ = jax.vmap(lambda start: descend(residuals, weight, start))(starts)
+    return jax.vmap(lambda pose: upright(target, shelf, pose))(poses)
+
+
+def tilted_placements(
+    target: Target, origin: Float[Array, " 3"], points: Float[Array, "p 3"], valid: Bool[Array, " p"]
+) -> Placement:
+    """Placements of a target that leans or lies, and fits points on its visible side, with a leading axis.
+
+    Args:
+      target: static.
+      origin: the camera's position in the world [m].
+      points: in the world [m].
+      valid: which of them are to be on the target's surface.
+    """
+    weight, points, middle, outwards = _visible_side(origin, points, valid)
+    rotations = jnp.asarray(_tilted(target.solid), jnp.float32)
+    centre = middle + 0.65 * min(target.half_size) * outwards
+
+    def placed(step: Array, rotation: Array) -> Placement:
+        return Placement(matmul(exponential(step[3:]), rotation), centre + step[:3])
+
+    def fit(rotation: Array) -> Placement:
+        residuals = lambda step: away_from(target, placed(step, rotation), points)  # noqa: E731
+        return placed(descend(residuals, weight, jnp.zeros(6), LONGEST_FREE_STEP)[0], rotation)
+
+    return jax.vmap(fit)(rotations)
+
+
+def _visible_side(
+    origin: Float[Array, " 3"], points: Float[Array, "p 3"], valid: Bool[Array, " p"]
+) -> tuple[Array, ...]:
+    """Weights of points, finite points, their mean, and the level direction away from the camera."""
+    weight = valid.astype(jnp.float32)
+    points = jnp.where(valid[:, None], points, 0.0)
+    middle = jnp.sum(points, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
+    level = (middle - origin) * jnp.array([1.0, 1.0, 0.0])
+    return weight, points, middle, level / jnp.maximum(jnp.sqrt(jnp.sum(level**2) + 1e-12), 1e-6)
+
+
+def _tilted(solid: Solid) -> Float[np.ndarray, "starts 3 3"]:
+    """Rotations to start from: upright, and lying on the side, on either side if it has two: at four angles, or at
+    eight if its ends differ."""
+    x, y, z = np.eye(3)
+    laid: list[Any] = [np.stack([y, z, x])] if solid.round else [np.stack([y, z, x]), np.stack([z, x, y])]
+    turns = [
+        np.array([[math.cos(a), -math.sin(a), 0.0], [math.sin(a), math.cos(a), 0.0], [0.0, 0.0, 1.0]])
+        for a in np.arange(4 if solid.ends_alike else 8) * (math.pi / 4)
+    ]
+    standing = turns[:1] if solid.round else turns[:2] if solid.turn <= math.pi else turns[::2]
+    return np.stack([*standing, *(turn @ rotation for rotation in laid for turn in turns)])

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.images.detection import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.images.labels import MISSING, OTHER
-from mechsearch_jax.images.target_pixels import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.perception.confidence import Measures, confidence_of, measures_of
 from mechsearch_jax.perception.hypotheses import SLOTS, bordering, distinct, fitted, parts, pixels_of
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mechsearch_jax.calibration.faces import FACES, Face
-from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.calibration.fit import FACES, Face
+from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.cloud import above_board
+from mechsearch_jax.images.detection import fitted_pose
 from mechsearch_jax.images.planes import PlaneConfig, find_plane
-from mechsearch_jax.images.target_pixels import fitted_pose
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection
+from mechsearch_jax.images.detection import ColouredDepth, coloured_pixels, detect, no_detection
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.measured import measured_share
-from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
@@ -54,6 +54,101 @@ class Setting(Protocol):
     def target(self) -> Target: ...
 
 
+class ViewImages(NamedTuple):
+    """The images of a `View`, as a recogniser reads them.
+
+    Attributes:
+      depth: along the camera's axis [m], shape (h, w); NaN where nothing was measured, infinite where there is nothing.
+      colour: red, green and blue in 0 to 1, shape (h, w, 3); None without a colour image.
+      mask: the number of the object that a pixel shows, or a label of `images.labels`, shape (h, w); None without one.
+      target_id: the target's number in the mask, negative if it does not show it; None if only its colour tells.
+    """
+
+    depth: Any
+    colour: Any = None
+    mask: Any = None
+    target_id: Any = None
+
+
+class ViewRecogniser(flax.struct.PyTreeNode):
+    """Recognises what the images of a view show: the part of recognition that robots and simulated cameras share.
+
+    A pytree, whose leaves are the networks' weights.
+
+    Attributes:
+      segmenter: labels images without a mask.
+      shapes: the recognition network.
+      detector: finds the target's pixels in a colour image.
+      target: whose pose is fitted; static, as all that follows.
+      refinement: how the network's shapes are fitted to the depth image.
+      fitter: fits objects to the segments of images without a mask.
+      mask_fitter: fits objects to the segments of a mask.
+    """
+
+    segmenter: Segmenter
+    shapes: ShapeNetwork
+    detector: TargetDetector
+    target: Target = flax.struct.field(pytree_node=False)
+    refinement: RefinementConfig = flax.struct.field(pytree_node=False, default_factory=RefinementConfig)
+    fitter: Fitter = flax.struct.field(pytree_node=False, default_factory=Explaining)
+    mask_fitter: Fitter = flax.struct.field(pytree_node=False, default=as_segmented)
+
+    @classmethod
+    def of(
+        cls,
+        target: Target,
+        *,
+        segmenter: Segmenter | None = None,
+        weights: Weights | None = None,
+        detector: TargetDetector | None = None,
+        refinement: RefinementConfig | None = None,
+        fitter: Fitter | None = None,
+        mask_fitter: Fitter | None = None,
+    ) -> ViewRecogniser:
+        """The recogniser of a target; see `Recogniser` for the defaults.
+
+        Raises:
+          InputError: weights are missing, damaged or of another network.
+        """
+        return cls(
+            _as_pytree(segmenter or NetworkSegmenter.of()),
+            ShapeNetwork.of(weights),
+            _as_pytree(detector or TargetColour.lit()),
+            target,
+            refinement or RefinementConfig(),
+            fitter or Explaining(),
+            mask_fitter or as_segmented,
+        )
+
+    def __call__(self, camera: Camera, view: View, shelf: Shelf, images: ViewImages) -> Observation:
+        """The observation of the images of a view; the same images always give the same observation.
+
+        Args:
+          camera: of the full image.
+          view: the rays of it that the images have.
+          shelf: in the images.
+          images: of the view.
+        """
+        fitted, visible, share = self.fitted(camera, view, shelf, images)
+        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, share)
+
+    def fitted(
+        self, camera: Camera, view: View, shelf: Shelf, images: ViewImages
+    ) -> tuple[Fitted, Bool[Array, ""], Float[Array, "rows columns"]]:
+        """What was made of the images, with the pixels of each object; whether the target is visible; and the share of
+        the full image that was measured, see `images.measured.measured_share`.
+
+        Args:
+          camera, view, shelf, images: as above.
+        """
+        # Not of the caller's key, lest an object be seen or not by chance.
+        keys = jax.random.split(jax.random.key(0), 3)
+        image, visible, share = labelled(self, keys[0], camera, view, shelf, images)
+        fitter = self.fitter if images.mask is None else self.mask_fitter
+        settings = (self.shapes, view.camera, shelf, self.target, self.refinement)
+        return fitter(keys[1:], image, *settings, least=SAMPLED * _threshold(camera, view)), visible, share
+
+
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
 class Recogniser:
@@ -67,28 +162,16 @@ class Recogniser:
     board, and cut to the part in which the shelf's space appears.
 
     Attributes:
+      core: recognises what the view shows.
       camera: of the images; depth and colour are registered to it.
       view: the part of the images that is used.
       shelf: in the view.
-      target: whose pose is fitted.
-      segmenter: labels images without a mask.
-      shapes: the recognition network.
-      detector: finds the target's pixels in a colour image.
-      refinement: how the network's shapes are fitted to the depth image.
-      fitter: fits objects to the segments of images without a mask.
-      mask_fitter: fits objects to the segments of a mask.
     """
 
+    core: ViewRecogniser
     camera: Camera
     view: View
     shelf: Shelf
-    target: Target
-    segmenter: Segmenter
-    shapes: ShapeNetwork
-    detector: TargetDetector
-    refinement: RefinementConfig
-    fitter: Fitter
-    mask_fitter: Fitter
 
     def __init__(
         self,
@@ -123,41 +206,37 @@ class Recogniser:
         check_camera(camera, problem.shelf)
         # The decorator would take this for a finished pytree.
         with own_settings():
-            fields = {
-                "camera": camera,
-                "view": thinned_view(camera, problem.shelf),
-                "shelf": problem.shelf,
-                "target": problem.target,
-                "segmenter": _as_pytree(segmenter or NetworkSegmenter.of()),
-                "shapes": ShapeNetwork.of(weights),
-                "detector": _as_pytree(detector or TargetColour.lit()),
-                "refinement": refinement or RefinementConfig(),
-                "fitter": fitter or Explaining(),
-                "mask_fitter": mask_fitter or as_segmented,
-            }
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+            core = ViewRecogniser.of(
+                problem.target,
+                segmenter=segmenter,
+                weights=weights,
+                detector=detector,
+                refinement=refinement,
+                fitter=fitter,
+                mask_fitter=mask_fitter,
+            )
+            self._set(core, camera, thinned_view(camera, problem.shelf), problem.shelf)
+
+    def _set(self, *values: Any) -> None:
+        for field, value in zip(dataclasses.fields(Recogniser), values, strict=True):
+            object.__setattr__(self, field.name, value)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        return (self.core, self.camera, self.view, self.shelf), None
+
+    @classmethod
+    def tree_unflatten(cls, static: None, leaves: tuple[Any, ...]) -> Recogniser:
+        made = object.__new__(cls)
+        made._set(*leaves)
+        return made
 
     @property
     def trained(self) -> dict[str, TrainedView]:
         """Camera and shelf in the training of the networks, by the networks' names, if their cards record them."""
-        views = {"recognition": self.shapes.view}
-        if isinstance(self.segmenter, NetworkSegmenter):
-            views["segmentation"] = self.segmenter.view
+        views = {"recognition": self.core.shapes.view}
+        if isinstance(self.core.segmenter, NetworkSegmenter):
+            views["segmentation"] = self.core.segmenter.view
         return {name: view for name, view in views.items() if view is not None}
-
-    def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        data = (self.segmenter, self.shapes, self.detector, self.camera, self.view, self.shelf)
-        return data, (self.target, self.refinement, self.fitter, self.mask_fitter)
-
-    @classmethod
-    def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
-        made = object.__new__(cls)
-        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf")
-        names = (*names, "target", "refinement", "fitter", "mask_fitter")
-        for name, value in zip(names, (*leaves, *static), strict=True):
-            object.__setattr__(made, name, value)
-        return made
 
     @in_own_settings
     def __call__(
@@ -196,30 +275,21 @@ class Recogniser:
         check_images(self.camera, depth, colour, mask, target_id)
         return self.unchecked(key, depth, colour, mask, target_id)
 
+    @in_own_settings
     def unchecked(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
     ) -> Observation:
         """The same of images that `check_images` was called with before."""
-        fitted, visible, share = self.fitted(key, depth, colour, mask, target_id)
-        return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, share)
+        images = view_images(self.view, depth, colour, mask, target_id)
+        return self.core(self.camera, self.view, self.shelf, images)
 
     @in_own_settings
     def fitted(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
     ) -> tuple[Fitted, Bool[Array, ""], Float[Array, "rows columns"]]:
-        """What was made of the view of the images, with the pixels of each object; whether the target is visible; and
-        the share of the full image that was measured, see `images.measured.measured_share`.
-
-        Args:
-          key, depth, colour, mask, target_id: as above; they are not checked.
-        """
-        # Not of the caller's key, lest an object be seen or not by chance.
-        keys = jax.random.split(jax.random.key(0), 3)
-        image, visible, share = _labelled(self, keys[0], depth, colour, mask, target_id)
-        fitter = self.fitter if mask is None else self.mask_fitter
-        settings = (self.shapes, self.view.camera, self.shelf, self.target, self.refinement)
-        unseen = found_pixels(self.camera) / self.view.stride**2
-        return fitter(keys[1:], image, *settings, least=SAMPLED * unseen), visible, share
+        """`ViewRecogniser.fitted` of a camera's images, which are not checked."""
+        images = view_images(self.view, depth, colour, mask, target_id)
+        return self.core.fitted(self.camera, self.view, self.shelf, images)
 
 
 def _as_pytree(slot: Any) -> Any:
@@ -228,36 +298,54 @@ def _as_pytree(slot: Any) -> Any:
 
 
 @cached_jit()
-def _labelled(
-    recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
-) -> tuple[LabelledImage, Bool[Array, ""], Float[Array, "rows columns"]]:
-    """The shelf's part of the image with labels, whether the target is visible in it, and what of it was measured."""
-    camera, view, shelf = recogniser.camera, recogniser.view, recogniser.shelf
+def view_images(view: View, depth: Any, colour: Any, mask: Any, target_id: Any) -> ViewImages:
+    """The view's part of a camera's images, which are as of `Recogniser`."""
     seen = view.of(jnp.asarray(depth, jnp.float32))
-    seen = jnp.where(measured(seen), seen, jnp.nan)
+    if colour is not None:
+        colour = view.of(jnp.asarray(colour))
+        colour = colour.astype(jnp.float32) / (255.0 if colour.dtype == jnp.uint8 else 1.0)
+    mask = None if mask is None else view.of(jnp.asarray(mask))
+    target_id = None if target_id is None else jnp.asarray(target_id, jnp.int32)
+    return ViewImages(jnp.where(measured(seen), seen, jnp.nan), colour, mask, target_id)
+
+
+def _threshold(camera: Camera, view: View) -> float:
+    """A target of at most this many pixels of a view is not visible."""
+    return found_pixels(camera) / view.stride**2
+
+
+@cached_jit()
+def labelled(
+    core: ViewRecogniser, key: Key[Array, ""], camera: Camera, view: View, shelf: Shelf, images: ViewImages
+) -> tuple[LabelledImage, Bool[Array, ""], Float[Array, "rows columns"]]:
+    """The images of a view with labels, whether the target is visible in them, and what of the full image was measured.
+
+    Args:
+      core: labels them.
+      key: of the points that are drawn from the image.
+      camera, view, shelf, images: as of `ViewRecogniser`.
+    """
+    seen, colour, mask, target_id = images
     points = back_project(view.camera, seen)
 
     # Points on the board's faces may be the target's.
     near = above_board(shelf, points, -MARGIN)
-    threshold = found_pixels(camera) / view.stride**2
-    image = None
-    if colour is not None:
-        pixels = view.of(jnp.asarray(colour))
-        scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
-        image = ColouredDepth(points, seen, pixels.astype(jnp.float32) / scale)
+    threshold = _threshold(camera, view)
     if mask is None:
         detection = no_detection(seen)
-        if image is not None:
-            detection = detect(key, recogniser.detector, recogniser.target, shelf, view.camera, image, threshold)
+        if colour is not None:
+            image = ColouredDepth(points, seen, colour)
+            detection = detect(key, core.detector, core.target, shelf, view.camera, image, threshold)
         visible, of_target = detection.visible, detection.pixels
         # As objects, small segments would rule out the pose of a target that is not detected.
-        labels = recogniser.segmenter(key, shelf, points, of_target | detection.unclear)
+        segments = core.segmenter(key, shelf, points, of_target | detection.unclear)
+        labels = large_segments(segments, SAMPLED * threshold)
     else:
-        instances = on_own_surfaces(points, _instances(view.of(jnp.asarray(mask))), above_board(shelf, points))
+        instances = on_own_surfaces(points, _instances(mask), above_board(shelf, points))
         # The mask says what is one thing, so its colour alone tells the target from the others.
         coloured = jnp.zeros(seen.shape, bool)
-        if image is not None:
-            coloured = coloured_pixels(recogniser.detector, image.colour, seen) & near
+        if colour is not None:
+            coloured = coloured_pixels(core.detector, colour, seen) & near
         of_target, freed = _target_in(instances, coloured, target_id)
         of_target &= near
         labels = _labels(instances, freed, shelf, points)
@@ -265,6 +353,12 @@ def _labelled(
         visible = (jnp.sum(of_target) > threshold).astype(bool)
     image = LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible)
     return image, visible, measured_share(camera, view, seen)
+
+
+def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:
+    """Labels with segments, numbered from 0, of at most `pixels` pixels set to OTHER."""
+    small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
+    return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)
 
 
 def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Int, Key
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.images.cloud import middle
+from mechsearch_jax.images.detection import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.images.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.images.target_pixels import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights

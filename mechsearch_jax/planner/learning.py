@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.step import SearchState
 from mechsearch_jax.planner.trials import Trials, TrialScenes, scenes_of
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.errors import InputError
@@ -121,11 +121,9 @@ class LearnedFriction:
         before = self.probabilities[list(rows)]
         self.probabilities[list(rows)] = self._trials.learned(problem, before, scenes, actions, seen)
 
-    def learn_first(
-        self, problem: Problem, belief: Belief, before: Observation, action: Action, after: Observation
-    ) -> None:
-        """Learn in the first search from an action, and from the belief and the observations before and after it."""
-        search = scenes_of(belief, before), action, after.objects
+    def learn_first(self, problem: Problem, before: SearchState, after: Observation) -> None:
+        """Learn in the first search from a state, what was done in it, and the observation after it."""
+        search = scenes_of(before.belief, before.observation), before.action, after.objects
         self.learn(problem, [0], *jax.tree.map(lambda a: np.asarray(a)[None], search))
 
     @property

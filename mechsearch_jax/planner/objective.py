@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.belief.belief import Belief, possible_poses
 from mechsearch_jax.config.config import Weights
-from mechsearch_jax.graspability import INFEASIBLE, crowding, graspability, pairs
+from mechsearch_jax.grasping.graspability import INFEASIBLE, crowding, graspability, pairs
 from mechsearch_jax.planner.state import State
 from mechsearch_jax.problem.problem import Problem
 

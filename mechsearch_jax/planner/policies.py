@@ -26,6 +26,7 @@ from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
@@ -34,7 +35,6 @@ from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import concatenate, grasps_to_try, sequences_to_try
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.retrieval import GraspChoice, best_grasp, top_grasps
 from mechsearch_jax.runtime.compiled import CachedJit, cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions.sampler import sample_action
+from mechsearch_jax.actions.candidates import sample_action
 from mechsearch_jax.actions.types import Sample
 from mechsearch_jax.belief.belief import Belief, possible_space
 from mechsearch_jax.existence import occluders
-from mechsearch_jax.graspability import pairs
+from mechsearch_jax.grasping.graspability import pairs
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.state import State
 from mechsearch_jax.problem.problem import Problem

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, no_candidates
+from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, contact_probability, no_candidates
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Action, Prediction, Sample
 from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.belief.moved_target import candidate_of
@@ -26,13 +25,13 @@ from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.existence import existence, no_views, object_views
 from mechsearch_jax.geometry.masked import on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
+from mechsearch_jax.grasping.graspability import grasp_hits, no_hits, pairs, split_found
+from mechsearch_jax.grasping.retrieval import found_hits
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
 from mechsearch_jax.planner.proposal import Propose
 from mechsearch_jax.planner.state import Decision, Sequences, State
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.retrieval import found_hits
 
 # Least decrease of J, as a share of J, that counts as a gain.
 GAIN = 0.02

@@ -1,8 +1,7 @@
 """Trials: actions are tried in physics before one is made, a stage between a policy's proposal and the action.
 
 The planner's predictions are quick and rough. A decision therefore holds ranked alternatives; trials return their
-results, and `choose` takes the first that succeeds. `decide` runs this stage for a single scene,
-`envs.episode.many_slots` for many at once, and `envs.trials` simulates.
+results, and `choose` takes the first that succeeds. `step` says when; `envs.trials` simulates.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import enum
 import functools
 import math
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import flax.struct
 import jax
@@ -104,51 +103,34 @@ class TwoStagePolicy(Protocol):
         ...
 
 
-def decide(
-    policy,
-    trials: Trials | None,
-    key: Array,
-    problem: Problem,
-    belief: Belief,
-    observation: Observation,
-    last: bool = False,
-) -> Decision:
-    """Decide for a single scene: the policy proposes, trials try, `choose` chooses. On the host.
+class TriedActions(NamedTuple):
+    """The actions that were tried out before one was made, in order, up to the first that succeeded; NumPy arrays.
 
-    Planned actions are tried only if the target is not taken out.
-
-    Args:
-      policy: see `policies.Policy`; one that `TwoStagePolicy` plans only if no grasp succeeds.
-      trials: tries the alternatives; None for no trials.
-      key, problem, belief, observation: as for the policy.
-      last: whether no further action is allowed; see `choose`.
+    Attributes:
+      action: fields with a leading axis K.
+      result: the `TrialResult` of each, shape (K,).
     """
-    arguments = (key, problem, belief, observation)
-    if trials is None or not isinstance(policy, TwoStagePolicy):
-        return tried(trials, problem, belief, observation, policy(*arguments), last)
-    if belief.found:
-        decision = tried(trials, problem, belief, observation, policy.retrieval(*arguments), last)
-        if int(decision.action.kind) == ActionKind.RETRIEVE:
-            return decision
-    return tried(trials, problem, belief, observation, policy.planned(*arguments), last)
+
+    action: Action
+    result: Int[np.ndarray, " k"]
 
 
-def tried(
-    trials: Trials | None,
-    problem: Problem,
-    belief: Belief,
-    observation: Observation,
-    decision: Decision,
-    last: bool = False,
-) -> Decision:
-    """A decision after trials of its alternatives; unchanged without alternatives or trials."""
-    alternatives = decision.alternatives
-    if trials is None or alternatives is None:
-        return decision
-    scene = scenes_of(belief, observation)
-    scenes, rows = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get((scene, alternatives)))
-    results = trials(problem, scenes, rows.actions, rows.worth)
-    return choose(decision, jnp.asarray(results[0], jnp.int32), jnp.array(last))
+def nothing_tried() -> TriedActions:
+    """No actions."""
+    return TriedActions(jax.tree.map(lambda a: np.asarray(a)[None][:0], no_action()), np.zeros(0, np.int32))
+
+
+def tried(alternatives: Alternatives, results: Int[np.ndarray, "1 k"]) -> TriedActions:
+    """What the trials of a single scene came to, whose alternatives have a leading axis of 1.
+
+    Those after the first success are left out: nothing depends on them.
+    """
+    rows = np.flatnonzero(alternatives.worth[0])
+    won = np.flatnonzero(results[0][rows] == TrialResult.SUCCEEDED)
+    rows = rows[: won[0] + 1] if len(won) else rows
+    return TriedActions(
+        jax.tree.map(lambda a: a[0][rows], alternatives.actions), np.asarray(results[0], np.int32)[rows]
+    )
 
 
 def scenes_of(belief: Belief, observation: Observation) -> TrialScenes:

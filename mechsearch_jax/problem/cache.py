@@ -16,7 +16,7 @@ import numpy as np
 from mechsearch_jax.actions.config import ActionTables
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceTables
-from mechsearch_jax.graspability import CandidateGrasps, GraspTables
+from mechsearch_jax.grasping.graspability import CandidateGrasps, GraspTables
 from mechsearch_jax.problem import problem as problems
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.gripper import Gripper

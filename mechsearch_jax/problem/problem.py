@@ -12,8 +12,8 @@ from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tabl
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceConfig, ExistenceTables, existence_tables
-from mechsearch_jax.graspability import CandidateGrasps, GraspTables, candidate_grasps, grasp_tables
-from mechsearch_jax.retrieval import TargetGrasps
+from mechsearch_jax.grasping.graspability import CandidateGrasps, GraspTables, candidate_grasps, grasp_tables
+from mechsearch_jax.grasping.retrieval import TargetGrasps
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.cores import on_host

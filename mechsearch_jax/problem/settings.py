@@ -18,8 +18,8 @@ from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
-from mechsearch_jax.workspace.compound_file import parse_compound
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
+from mechsearch_jax.workspace.scenario import parse_compound
 from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
 
 PLANNER = "planner"

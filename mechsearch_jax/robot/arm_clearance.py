@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import HAND, LINKS, Primitive, fingers
+from mechsearch_jax.robot.gripper import HAND, LINKS, RobotPart, fingers
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Edge of the cells into which boxes are divided, with a sphere around each [m]. Coarse cells are for self-collisions,
@@ -227,14 +227,14 @@ def _base_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
     return tuple(capsules)
 
 
-def _in_hand(held: Held) -> tuple[Primitive, ...]:
+def _in_hand(held: Held) -> tuple[RobotPart, ...]:
     """The held object, in the hand frame."""
     pose = np.array(held.T_gripper_held, float)
     pose[2, 3] += kinematics.FINGER_TIPS
-    return (Primitive("box", tuple(held.half_size), pose),)
+    return (RobotPart("box", tuple(held.half_size), pose),)
 
 
-def _spheres(bodies: Sequence[tuple[int, tuple[Primitive, ...]]], cell: float) -> Spheres:
+def _spheres(bodies: Sequence[tuple[int, tuple[RobotPart, ...]]], cell: float) -> Spheres:
     """Spheres around all primitives of pairs of a frame, ascending, and its primitives."""
     frames, centres, radii = [], [], []
     for frame, primitives in bodies:

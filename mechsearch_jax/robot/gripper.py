@@ -22,7 +22,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.geometry.swept_cloud import Solid, cloud_of
+from mechsearch_jax.geometry.swept_cloud import SolidKey, cloud_of
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.kinematics import Numbers
@@ -81,7 +81,7 @@ class Gripper:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Primitive:
+class RobotPart:
     """A box or a capsule in the frame of a link.
 
     Attributes:
@@ -99,16 +99,16 @@ def _box(
     half_size: tuple[float, float, float],
     centre: tuple[float, float, float],
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-) -> Primitive:
+) -> RobotPart:
     """A box from its half-extents, centre and orientation (w, x, y, z)."""
-    return Primitive("box", half_size, _pose(trimesh.transformations.quaternion_matrix(quaternion), centre))
+    return RobotPart("box", half_size, _pose(trimesh.transformations.quaternion_matrix(quaternion), centre))
 
 
-def _capsule(radius: float, start: tuple[float, float, float], end: tuple[float, float, float]) -> Primitive:
+def _capsule(radius: float, start: tuple[float, float, float], end: tuple[float, float, float]) -> RobotPart:
     """A capsule from its radius and the ends of its axis."""
     axis = np.subtract(end, start)
     rotation = trimesh.geometry.align_vectors((0.0, 0.0, 1.0), axis)
-    return Primitive("capsule", (radius, float(np.linalg.norm(axis)) / 2), _pose(rotation, np.add(start, end) / 2))
+    return RobotPart("capsule", (radius, float(np.linalg.norm(axis)) / 2), _pose(rotation, np.add(start, end) / 2))
 
 
 def _pose(rotation: Any, origin: Any) -> np.ndarray:
@@ -178,7 +178,7 @@ LINKS = (
 )
 
 
-def fingers(opening: float) -> tuple[Primitive, ...]:
+def fingers(opening: float) -> tuple[RobotPart, ...]:
     """Both fingers, `opening` m apart, in the hand frame."""
     left = np.eye(4)
     left[:3, 3] = (0.0, opening / 2, FINGER_BASE)
@@ -191,7 +191,7 @@ def fingers(opening: float) -> tuple[Primitive, ...]:
     )
 
 
-def primitives_in_gripper(gripper: Gripper, opening: float, q7: float) -> tuple[Primitive, ...]:
+def primitives_in_gripper(gripper: Gripper, opening: float, q7: float) -> tuple[RobotPart, ...]:
     """The primitives of the hand, both fingers, link 7 and link 6, with their poses in the gripper frame.
 
     Args:
@@ -264,7 +264,7 @@ def _sampled(
 ) -> Float[np.ndarray, "{count} 3"]:
     """`swept_cloud` of checked arguments; cached, because several tables of a problem need the same clouds."""
     primitives = primitives_in_gripper(gripper, opening, q7)
-    solids: list[Solid] = [(p.kind, p.size, p.T_frame_primitive.tobytes()) for p in primitives]
+    solids: list[SolidKey] = [(p.kind, p.size, p.T_frame_primitive.tobytes()) for p in primitives]
     return cloud_of(tuple(solids), gripper.front, FINE, count, distance, seed)
 
 

@@ -11,9 +11,7 @@ from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT
-from mechsearch_jax.images.checks.holes import hole_faults, unmeasured_target_faults
-from mechsearch_jax.images.checks.look import Look
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import Look, check_images, hole_faults, unmeasured_target_faults
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import lost_faults
@@ -61,7 +59,7 @@ def check_image(
       InputError: an image cannot be used, or the shelf is too far from where it should be.
     """
     check_images(setting.camera, *images)
-    detector = recogniser.detector if isinstance(recogniser, Recogniser) and images.target_id is None else None
+    detector = recogniser.core.detector if isinstance(recogniser, Recogniser) and images.target_id is None else None
     look = Look(setting.camera, setting.shelf, images.depth, images.colour, images.mask, detector)
     faults = image_warnings(setting, recogniser, look, images.target_id)
     return look, [*placement_faults(setting.camera, setting.shelf, images.depth, calibration), *faults]

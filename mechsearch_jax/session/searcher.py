@@ -25,7 +25,7 @@ from jaxtyping import Array
 
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
-from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
+from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
@@ -34,10 +34,10 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.plausibility import EMPTY_SHELF, sight_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.learning import LearnedFriction, restored
-from mechsearch_jax.planner.noted_trials import NotedTrials, nothing_tried
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
-from mechsearch_jax.planner.trials import Trials, decide
+from mechsearch_jax.planner.step import Decided, SearchState, believe, decide, unsearched
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.arm_config import check_joints
@@ -60,8 +60,6 @@ from mechsearch_jax.workspace.sight import check_camera
 LEAST_REACH = 0.5
 # Names of the kinds of action that leave the target on the shelf.
 KEEPS_TARGET = frozenset(kind.name for kind in KINDS.values() if not kind.takes_target and kind.code != ActionKind.NONE)
-# Decisions drawn in one step, until the arm can execute one.
-DRAWS = 4
 # What `warm_up` compiles, in this order.
 STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "the motion")
 
@@ -217,8 +215,7 @@ class Searcher:
             seen = jax.block_until_ready(self.recogniser(key, *images))
             hidden, visible = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
             stage()
-            belief = update_belief(problem, initial_belief(problem), hidden)
-            jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
+            belief = jax.block_until_ready(believe(problem, unsearched(problem, hidden), hidden)).belief
             stage()
             twin = self._twin()
             searching = twin._step_on(hidden, images)
@@ -281,17 +278,19 @@ class Searcher:
         problem, now = self.problem, self._now
         if now.finished:
             raise InputError("next: the target was taken out, and the search is finished; make another Searcher")
-        step_key = jax.random.fold_in(jax.random.key(self._seed), now.index)
-        # With the same key, a refused action would be drawn again.
-        recognition_key, decision_key = jax.random.split(jax.random.fold_in(step_key, now.refusals))
+        # As of an episode with this seed.
+        keys = jax.random.split(jax.random.key(self._seed))
+        decision_key, recognition_key = (jax.random.fold_in(key, now.index) for key in keys)
         images, present = converted(depth, colour, mask, target_id), self._present(joints, width)
         observation, warnings, unseen = self._seen(recognition_key, images)
-        last = (now.observation, now.action) if now.acted else (None, None)
-        belief = update_belief(problem, now.belief, observation, *last)
-        warnings += faults.belief_warnings(now.belief, belief, shelf_is_empty=EMPTY_SHELF in unseen)
-        learned = self._learned(observation)
+        before = SearchState(now.belief, now.observation, now.action)
+        if not now.acted:
+            before = before.replace(observation=observation, action=no_action())
+        state = believe(problem, before, observation)
+        warnings += faults.belief_warnings(now.belief, state.belief, shelf_is_empty=EMPTY_SHELF in unseen)
+        learned = self._learned(before, observation)
         trials = self._trials if learned is None else learned.trials([0])
-        decision, motion, noted = self._decide(decision_key, trials, belief, observation, images.depth, unseen, present)
+        decided, motion = self._decide(decision_key, trials, state, images.depth, unseen, present)
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -301,14 +300,14 @@ class Searcher:
             warnings=tuple(warnings),
             trajectory=motion.trajectory,
             observation=observation,
-            belief=belief,
-            decision=decision,
+            belief=state.belief,
+            decision=decided.decision,
             problem=problem,
             image=display_image(images.depth, images.colour),
         )
         self._keep(step, learned)
         if self._view is not None:
-            self._view.decided(step, nothing_tried() if noted is None else noted.tried())
+            self._view.decided(step, decided.tried)
             self._shown = step
         return step
 
@@ -352,7 +351,7 @@ class Searcher:
             check_joints("joints", joints, self.workcell.gripper.arm)
         return Present(joints, None if width is None else checked_width(width, self.problem.gripper.max_opening))
 
-    def _learned(self, observation: Observation) -> LearnedFriction | None:
+    def _learned(self, before: SearchState, observation: Observation) -> LearnedFriction | None:
         """What trials have learned from all executed actions, with the last images; None if they do not learn.
 
         An action that was broken off is not what is simulated, and teaches nothing.
@@ -360,33 +359,31 @@ class Searcher:
         now = self._now
         learned = restored(self._trials, now.hypothesis_probabilities)
         if learned is not None and now.acted and now.executed:
-            learned.learn_first(self.problem, now.belief, now.observation, now.action, observation)
+            learned.learn_first(self.problem, before, observation)
         return learned
 
     def _decide(
         self,
         key: Array,
         trials: Trials | None,
-        belief: Belief,
-        observation: Observation,
+        state: SearchState,
         depth: np.ndarray,
         unseen: tuple[str, ...],
         present: Present,
-    ) -> tuple[Decision, Motion, NotedTrials | None]:
-        """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it, and its trials if shown.
+    ) -> tuple[Decided, Motion]:
+        """A decision and its motion, drawn anew where the arm cannot execute it."""
+        problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
 
-        A retrieval is drawn only once, for its grasp does not depend on the key.
-        """
-        problem, arm, noted = self.problem, self.workcell.arm, None
-        for draw in range(DRAWS):
-            draw_key = jax.random.fold_in(key, draw) if draw else key
-            noted = NotedTrials(trials) if trials is not None and self._view is not None else None
-            last = self._now.index >= self.config.max_steps
-            decision = decide(self._policy, noted or trials, draw_key, problem, belief, observation, last)
-            motion = motion_of(problem, belief, observation, decision, depth, unseen, present, arm, self._motions)
-            if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
-                break
-        return decision, self._within_limit(motion), noted
+        def executable(decision: Decision) -> bool:
+            belief, observation = state.belief, state.observation
+            settings = unseen, present, arm, self._motions
+            motions.append(motion_of(problem, belief, observation, decision, depth, *settings))
+            return not motions[-1].blocked
+
+        last = self._now.index >= self.config.max_steps
+        refused = self._now.refusals
+        decided = decide(self._policy, trials, key, problem, state, last=last, refusals=refused, executable=executable)
+        return decided, self._within_limit(motions[-1])
 
     @property
     def _motions(self) -> TrajectoryConfig:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.actions.registry import ActionKind, kind_of
-from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.belief.belief import Belief, graspability_map, sweeps_unmeasured
 from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.observation import Observation

@@ -19,7 +19,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.hand import HandEvent
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
-from mechsearch_jax.workspace.compound_file import format_compound
+from mechsearch_jax.workspace.scenario import format_compound
 
 if TYPE_CHECKING:
     from mechsearch_jax.session.step import SearchStep

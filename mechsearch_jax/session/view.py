@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mechsearch_jax.planner.noted_trials import TriedActions
+from mechsearch_jax.planner.trials import TriedActions
 from mechsearch_jax.session.step import SearchStep
 
 

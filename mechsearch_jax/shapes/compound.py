@@ -2,12 +2,16 @@
 
 A body's frame has its origin at the centre of mass (`centred`). All volumes and masses are sums over the pieces: where
 pieces overlap, matter counts twice, as in MuJoCo.
+
+MuJoCo has no cone frustums, and a mesh would have to be compiled for every size. So physics, camera and volumes all
+take one, about its third axis, for the same stack of cylinders.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,14 +21,15 @@ from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.shapes import frustum
-from mechsearch_jax.shapes.registry import PRIMITIVES
+from mechsearch_jax.shapes.primitives import PRIMITIVES
 
 if TYPE_CHECKING:
     import trimesh
 
-# Name of the shape of bodies that are compounds, and of pieces that are convex polyhedra.
-COMPOUND, CONVEX = "compound", "convex"
+# Name of the shape of bodies that are compounds, and of pieces that are cone frustums and convex polyhedra.
+COMPOUND, FRUSTUM, CONVEX = "compound", "frustum", "convex"
+# The radius of a frustum's disc differs by about the first from its neighbours' [m]; it has at most so many.
+DISC_STEP, MOST_DISCS = 2e-3, 6
 # Code of convex polyhedra among the kinds of pieces.
 CONVEX_CODE = len(PRIMITIVES)
 # Most solids of a body once frustums are stacks of discs; most vertices of a convex polyhedron.
@@ -106,12 +111,30 @@ def solids(pieces: Sequence[Piece]) -> list[Piece]:
 
 
 def _solids(piece: Piece) -> list[Piece]:
-    if piece.shape != frustum.NAME:
+    if piece.shape != FRUSTUM:
         return [piece]
     axis, centre = piece.rotation[:, 2], np.array(piece.position)
     return [
         Piece("cylinder", (radius, radius, half), _three(centre + height * axis), piece.quaternion)
-        for height, radius, half in frustum.discs(piece.half_size)
+        for height, radius, half in discs(piece.half_size)
+    ]
+
+
+def discs(half_size: Sequence[float], count: int | None = None) -> list[tuple[float, float, float]]:
+    """The stack of a frustum: height of the centre, radius and half the height of each disc, from below [m].
+
+    Every disc has the volume of its part of the frustum.
+
+    Args:
+      half_size: radii at the lower and the upper end, and half the height [m].
+      count: number of discs; from `DISC_STEP` and `MOST_DISCS` if None.
+    """
+    low, high, half = half_size
+    count = count or min(max(math.ceil(abs(high - low) / DISC_STEP), 1), MOST_DISCS)
+    ends = [low + (high - low) * i / count for i in range(count + 1)]
+    return [
+        (half * ((2 * i + 1) / count - 1), math.sqrt((a * a + a * b + b * b) / 3), half / count)
+        for i, (a, b) in enumerate(itertools.pairwise(ends))
     ]
 
 

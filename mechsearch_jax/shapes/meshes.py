@@ -30,8 +30,7 @@ from mechsearch_jax.shapes.compound import (
     hull,
     hull_volume,
 )
-from mechsearch_jax.shapes.surfaces.deviation import beyond, deviation, nearest, turns_around
-from mechsearch_jax.shapes.surfaces.mending import SEAM, SPECK, Mended, mended, whole
+from mechsearch_jax.shapes.surfaces import SEAM, SPECK, Mended, beyond, deviation, mended, nearest, turns_around, whole
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -273,7 +272,7 @@ def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
     """The convex pieces of a mesh file, in the mesh's frame.
 
     Seams are welded, faces turned outwards, holes filled; loose parts that are tiny or flat, and closed ones inside
-    others, are left out, see `surfaces.mending`. A mesh of at most 16 connected parts that are convex then is taken as
+    others, are left out, see `surfaces`. A mesh of at most 16 connected parts that are convex then is taken as
     it is. Of any other, each part that is not convex is cut into at most `PIECES` pieces, and pieces are joined where
     there are too many; always the same, which are kept on disk, see `runtime.kept_arrays`. A `Note` warns of all that
     was filled or left out, where pieces are more than 1 mm off the surface, and where they are thinner than

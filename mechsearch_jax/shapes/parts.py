@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
-from mechsearch_jax.shapes import frustum
-from mechsearch_jax.shapes.compound import Compound, Piece, inside, mesh, solids
-from mechsearch_jax.shapes.registry import SHAPES
+from mechsearch_jax.shapes.compound import FRUSTUM, Compound, Piece, discs, inside, mesh, solids
+from mechsearch_jax.shapes.primitives import SHAPES
 
 # Most parts of a body.
 PARTS = 4
@@ -78,8 +77,8 @@ def _nearest(piece: Piece, count: int) -> list[Part]:
             return [_of_piece(piece, half, _SMOOTH)]
         case "capsule":
             return [_of_piece(piece, half, (_capsule_exponent(half), 1.0))]
-        case frustum.NAME:
-            stack = frustum.discs(half, count)
+        case "frustum":
+            stack = discs(half, count)
             return [_of_piece(piece, (radius, radius, tall), _ROUND, along) for along, radius, tall in stack]
         case _:
             return [_fitted([piece])]
@@ -131,7 +130,7 @@ def _counts(pieces: Sequence[Piece]) -> list[int]:
 
     def wrong(i: int) -> float:
         low, high, half = pieces[i].half_size
-        return abs(high - low) * max(low, high) * half / counts[i] if pieces[i].shape == frustum.NAME else 0.0
+        return abs(high - low) * max(low, high) * half / counts[i] if pieces[i].shape == FRUSTUM else 0.0
 
     while sum(counts) < PARTS and (worst := max(range(len(pieces)), key=wrong)) is not None and wrong(worst) > 0:
         counts[worst] += 1

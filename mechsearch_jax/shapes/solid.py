@@ -1,4 +1,4 @@
-"""The solid that a target is: a box, a cylinder, or the union of a compound's pieces, behind one protocol; without JAX.
+"""The solid that a target is: a box, a cylinder, or the union of a compound's pieces; without JAX.
 
 Points and directions are in the body's frame, whose origin is the centre of a shape and the centre of mass of a
 compound. Methods with a `library`, NumPy or `jax.numpy`, take and return its arrays.
@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +18,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, mesh, solids
-from mechsearch_jax.shapes.registry import PRIMITIVES
-from mechsearch_jax.shapes.shape import Shape
+from mechsearch_jax.shapes.primitives import PRIMITIVES, Shape
 
 if TYPE_CHECKING:
     import trimesh
@@ -35,54 +34,40 @@ SURFACE_POINTS = 2000
 JUST_OUTSIDE = 2e-4
 
 
-class Solid(Protocol):
-    """What is computed with a target's geometry."""
+@dataclasses.dataclass(frozen=True)
+class Solid:
+    """What is computed with a target's geometry; `solid_of` makes it.
 
-    @property
-    def round(self) -> bool:
-        """Whether it is a solid of revolution about its third axis."""
-        ...
+    Attributes:
+      body: a shape, or a compound, which is centred.
+      half_size: half-extents [m]; of a compound those of the smallest box about its centre of mass.
+      round: whether it is a solid of revolution about its third axis.
+      turn: the yaw after which it looks the same [rad]: half a turn or a full one; half a turn if it is round.
+      ends_alike: whether it looks the same upside down.
+      yaws: usual number of candidate yaw angles over a `turn`.
+      bottom, top: how far below the origin its lowest point is, and how far above its highest [m].
+      radius: largest distance of a point from the vertical axis [m].
+      breadth: half of its least width seen from above [m].
+    """
 
-    @property
-    def turn(self) -> float:
-        """The yaw after which it looks the same [rad]: half a turn or a full one; half a turn if it is round."""
-        ...
-
-    @property
-    def ends_alike(self) -> bool:
-        """Whether it looks the same upside down."""
-        ...
-
-    @property
-    def yaws(self) -> int:
-        """Usual number of candidate yaw angles over a `turn`."""
-        ...
-
-    @property
-    def bottom(self) -> float:
-        """How far below the origin its lowest point is [m]."""
-        ...
-
-    @property
-    def top(self) -> float:
-        """How far above the origin its highest point is [m]."""
-        ...
-
-    @property
-    def radius(self) -> float:
-        """Largest distance of a point from the vertical axis [m]."""
-        ...
-
-    @property
-    def breadth(self) -> float:
-        """Half of its least width seen from above [m]."""
-        ...
+    body: Shape | Compound
+    half_size: tuple[float, float, float]
+    round: bool
+    turn: float
+    ends_alike: bool
+    yaws: int
+    bottom: float
+    top: float
+    radius: float
+    breadth: float
 
     def distance(
         self, level: Float[Any, "*batch 2"], height: Float[Any, "*batch"], library: Any
     ) -> Float[Any, "*batch"]:
         """Signed distance of points to its surface [m], negative inside; its derivatives are finite everywhere."""
-        ...
+        if isinstance(self.body, Shape):
+            return self.body.distance(level, height, self.half_size, library)
+        return union.distance(self.body, [level[..., 0], level[..., 1], height], library)
 
     def cut(
         self,
@@ -91,135 +76,61 @@ class Solid(Protocol):
         grown: float,
         library: Any,
     ) -> Float[Any, "*rays"]:
-        """Where rays from outside enter it, see `shape.Shape.cut`, if it is larger by `grown` on all sides [m]."""
-        ...
+        """Where rays from outside enter it, see `Primitive.cut`, if it is larger by `grown` on all sides [m]."""
+        if not isinstance(self.body, Shape):
+            return union.cut(self.body, origin, direction, grown, library)
+        half = np.array(self.half_size)
+        half = half + grown if grown >= 0.0 else np.maximum(half + grown, -grown)
+        return self.body.cut(origin, direction, half, library)
 
     def extent(self, direction: Float[Any, "*batch 3"], library: Any) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
         """How far it reaches from its origin against and along unit vectors [m]."""
-        ...
-
-    def rim(self) -> Float[np.ndarray, "corners 2"]:
-        """A convex polygon around it seen from above, counter-clockwise [m]."""
-        ...
-
-    def hulls(self, erosion: float) -> list[trimesh.Trimesh]:
-        """Convex solids that together are the solid shrunk by `erosion` on all sides [m]."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
-class SingleShape:
-    """The `Solid` of a shape, with half-extents [m]."""
-
-    shape: Shape
-    half_size: tuple[float, float, float]
-
-    @property
-    def round(self) -> bool:
-        return self.shape.round
-
-    @property
-    def turn(self) -> float:
-        return math.pi
-
-    @property
-    def ends_alike(self) -> bool:
-        return True
-
-    @property
-    def yaws(self) -> int:
-        return self.shape.yaws
-
-    @property
-    def bottom(self) -> float:
-        return self.half_size[2]
-
-    @property
-    def top(self) -> float:
-        return self.half_size[2]
-
-    @property
-    def radius(self) -> float:
-        return self.half_size[0] if self.round else math.hypot(*self.half_size[:2])
-
-    @property
-    def breadth(self) -> float:
-        return min(self.half_size[:2])
-
-    def distance(self, level, height, library):
-        return self.shape.distance(level, height, self.half_size, library)
-
-    def cut(self, origin, direction, grown, library):
-        half = np.array(self.half_size)
-        half = half + grown if grown >= 0.0 else np.maximum(half + grown, -grown)
-        return self.shape.cut(origin, direction, half, library)
-
-    def extent(self, direction, library):
-        reach = self.shape.reach(direction, library.array(self.half_size)[None], library)
+        if not isinstance(self.body, Shape):
+            return _extent(self.body, direction, library)
+        reach = self.body.reach(direction, library.array(self.half_size)[None], library)
         return reach, reach
 
     def rim(self) -> Float[np.ndarray, "corners 2"]:
-        return self.shape.rim(self.half_size)
+        """A convex polygon around it seen from above, counter-clockwise [m]."""
+        return self.body.rim(self.half_size) if isinstance(self.body, Shape) else _rim(self.body)
 
     def hulls(self, erosion: float) -> list[trimesh.Trimesh]:
-        return [self.shape.mesh([half - erosion for half in self.half_size])]
+        """Convex solids that together are the solid shrunk by `erosion` on all sides [m]."""
+        if isinstance(self.body, Shape):
+            return [self.body.mesh([half - erosion for half in self.half_size])]
+        return [_shrunk(solid, erosion) for solid in solids(self.body.pieces)]
 
 
-@dataclasses.dataclass(frozen=True)
-class Union:
-    """The `Solid` of a compound, which is centred."""
+@functools.lru_cache(maxsize=256)
+def solid_of(body: Shape | Compound, half_size: tuple[float, float, float]) -> Solid:
+    """The geometry of a shape of these half-extents [m], or of a centred compound that they are a box around."""
+    if isinstance(body, Shape):
+        radius = half_size[0] if body.round else math.hypot(*half_size[:2])
+        low = high = half_size[2]
+        return Solid(
+            body, half_size, body.round, math.pi, True, body.yaws, low, high, radius, breadth=min(half_size[:2])
+        )
+    symmetry = _symmetry(body)
+    turn = symmetry or math.pi
+    bottom, top = (float(reach) for reach in _extent(body, np.array([0.0, 0.0, 1.0]), np))
+    angle = np.arange(180) * (math.pi / 180)
+    against, along = _extent(body, np.stack([np.cos(angle), np.sin(angle), np.zeros(180)], axis=1), np)
+    return Solid(
+        body,
+        half_size,
+        round=symmetry == 0.0,
+        turn=turn,
+        ends_alike=False,
+        yaws=1 if symmetry == 0.0 else round(YAWS * turn / (2 * math.pi)),
+        bottom=bottom,
+        top=top,
+        radius=float(np.linalg.norm(_rim(body), axis=1).max()),
+        breadth=float((against + along).min()) / 2,
+    )
 
-    compound: Compound
 
-    @property
-    def round(self) -> bool:
-        return _symmetry(self.compound) == 0.0
-
-    @property
-    def turn(self) -> float:
-        return _symmetry(self.compound) or math.pi
-
-    @property
-    def ends_alike(self) -> bool:
-        return False
-
-    @property
-    def yaws(self) -> int:
-        return 1 if self.round else round(YAWS * self.turn / (2 * math.pi))
-
-    @property
-    def bottom(self) -> float:
-        return float(union.reach(self.compound, np.array([0.0, 0.0, -1.0]), np))
-
-    @property
-    def top(self) -> float:
-        return float(union.reach(self.compound, np.array([0.0, 0.0, 1.0]), np))
-
-    @property
-    def radius(self) -> float:
-        return float(np.linalg.norm(self.rim(), axis=1).max())
-
-    @property
-    def breadth(self) -> float:
-        angle = np.arange(180) * (math.pi / 180)
-        level = np.stack([np.cos(angle), np.sin(angle), np.zeros(180)], axis=1)
-        against, along = self.extent(level, np)
-        return float((against + along).min()) / 2
-
-    def distance(self, level, height, library):
-        return union.distance(self.compound, [level[..., 0], level[..., 1], height], library)
-
-    def cut(self, origin, direction, grown, library):
-        return union.cut(self.compound, origin, direction, grown, library)
-
-    def extent(self, direction, library):
-        return union.reach(self.compound, -direction, library), union.reach(self.compound, direction, library)
-
-    def rim(self) -> Float[np.ndarray, "corners 2"]:
-        return _rim(self.compound)
-
-    def hulls(self, erosion: float) -> list[trimesh.Trimesh]:
-        return [_shrunk(solid, erosion) for solid in solids(self.compound.pieces)]
+def _extent(compound: Compound, direction: Float[Any, "*batch 3"], library: Any) -> tuple[Any, Any]:
+    return union.reach(compound, -direction, library), union.reach(compound, direction, library)
 
 
 def _shrunk(solid: Piece, erosion: float) -> trimesh.Trimesh:
@@ -267,7 +178,7 @@ def surface(compound: Compound, count: int, erosion: float = 0.0) -> Float[np.nd
     """
     import trimesh
 
-    whole: Any = trimesh.util.concatenate(Union(compound).hulls(erosion))
+    whole: Any = trimesh.util.concatenate([_shrunk(solid, erosion) for solid in solids(compound.pieces)])
     points, face = trimesh.sample.sample_surface(whole, 4 * count, seed=0)[:2]
     # Where solids touch or overlap, there is another one just outside of a surface.
     outside = np.asarray(points) + JUST_OUTSIDE * np.asarray(whole.face_normals)[face]

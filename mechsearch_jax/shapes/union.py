@@ -1,4 +1,4 @@
-"""The geometry of a compound as the union of its convex solids, for NumPy or JAX; without JAX.
+"""The geometry of a compound as the union of its convex solids, for NumPy or JAX, and on a grid; without JAX.
 
 Distances and cuts are the least of the solids', support functions the largest. Outside of a solid with edges a distance
 may be less than the true one, but not on its surface or inside: that of a convex polyhedron is to the farthest of the
@@ -7,6 +7,7 @@ planes of its faces, that of an ellipsoid is right to first order.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -14,13 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, solids
-from mechsearch_jax.shapes.registry import PRIMITIVES
+from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, solids, surface_points
+from mechsearch_jax.shapes.primitives import PRIMITIVES
 
 # A solid is shrunk to no less than this share of its half-extents.
 LEAST_SHARE = 0.5
 # Beyond every plane of a body [m]: the planes that fill up the rows of polyhedra with fewer faces.
 FAR = 1e3
+# Spacing of the grid, larger for bodies of more cells than the second number, and the rim around the body [m].
+STEP, CELLS, RIM = 0.002, 150_000, 0.006
+# Points whose distances are computed at once.
+BLOCK = 4096
 
 
 class Polyhedra(NamedTuple):
@@ -112,7 +117,7 @@ def _fold(step: Callable[[Any, Any], Any], start: Any, rows: tuple[Any, ...], li
     return jax.lax.scan(lambda state, row: (step(state, row), None), start, cast)[0]
 
 
-def _product(normal: Float[Any, " 3"], vector: Sequence[Any]) -> Any:
+def _product(normal: Any, vector: Sequence[Any]) -> Any:
     return vector[0] * normal[0] + vector[1] * normal[1] + vector[2] * normal[2]
 
 
@@ -141,7 +146,7 @@ def cut(
     grown: float,
     library: Any,
 ) -> Float[Any, "*rays"]:
-    """Where rays from outside enter the body, as `shape.Shape.cut`; all solids are larger by `grown` [m]."""
+    """Where rays from outside enter the body, as `Primitive.cut`; all solids are larger by `grown` [m]."""
     values = []
     for piece in _primitives(compound):
         start, along = _local(origin, piece, True), _local(direction, piece, False)
@@ -227,3 +232,49 @@ def inside(
 ) -> Bool[np.ndarray, "*batch"]:
     """Which points in the body's frame are in the body, deeper than a margin [m]."""
     return distance(compound, [points[..., i] for i in range(3)], np) < -margin
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Field:
+    """Signed distances to a surface [m], negative inside, at points of a grid.
+
+    Attributes:
+      low: the first point [m].
+      step: spacing of the points [m].
+      values: shape (nx, ny, nz).
+    """
+
+    low: Float[np.ndarray, " 3"]
+    step: float
+    values: Float[np.ndarray, "nx ny nz"]
+
+    @property
+    def high(self) -> Float[np.ndarray, " 3"]:
+        """The last point [m]."""
+        return self.low + self.step * (np.array(self.values.shape) - 1)
+
+    def at(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+        """Interpolated distances of points; beyond the grid that of its rim, which is outside of the body."""
+        from scipy.ndimage import map_coordinates
+
+        index = np.moveaxis((points - self.low) / self.step, -1, 0)
+        return map_coordinates(self.values, index, order=1, mode="nearest")
+
+    def slope(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """The outward unit normals of the surfaces of equal distance."""
+        steps = np.eye(3) * self.step
+        slope = np.stack([self.at(points + step) - self.at(points - step) for step in steps], axis=-1)
+        return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-9)
+
+
+@functools.lru_cache(maxsize=16)
+def field_of(compound: Compound) -> Field:
+    """The field of a compound; its arrays must not be changed."""
+    corners = surface_points(compound)
+    low, high = corners.min(axis=0) - RIM, corners.max(axis=0) + RIM
+    step = max(STEP, float(np.prod(high - low) / CELLS) ** (1 / 3))
+    axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    flat = points.reshape(-1, 3).astype(np.float32)
+    values = [distance(compound, list(flat[i : i + BLOCK].T), np) for i in range(0, len(flat), BLOCK)]
+    return Field(low, step, np.concatenate(values).reshape(points.shape[:-1]))

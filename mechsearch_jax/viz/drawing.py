@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import INFEASIBLE
+from mechsearch_jax.grasping.graspability import INFEASIBLE
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf

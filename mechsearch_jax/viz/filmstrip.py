@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.workspace.camera import Camera

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.robot.arm_clearance import FOOT
-from mechsearch_jax.robot.gripper import HAND, LINKS, Primitive, fingers
+from mechsearch_jax.robot.gripper import HAND, LINKS, RobotPart, fingers
 from mechsearch_jax.shapes import Capsule, shape_of
-from mechsearch_jax.viz.raycast import Colour, Solid
+from mechsearch_jax.viz.raycast import Colour, VisibleSolid
 
 WHITE, GREY, DARK = (0.93, 0.94, 0.95), (0.62, 0.65, 0.69), (0.27, 0.30, 0.34)
 # Colours of links 1 to 7.
@@ -16,7 +16,7 @@ COLOURS = (WHITE, WHITE, WHITE, WHITE, WHITE, GREY, GREY)
 _BOX, _CAPSULE = shape_of("box"), Capsule()
 
 
-def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[Solid]:
+def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[VisibleSolid]:
     """The foot, the arm, the hand and its fingers.
 
     Args:
@@ -31,7 +31,7 @@ def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[Soli
     return [_foot(), *solids]
 
 
-def panda_pieces() -> list[list[Solid]]:
+def panda_pieces() -> list[list[VisibleSolid]]:
     """The rigid pieces: links 1 to 7 and the hand in their frames, the left and the right finger in the hand's frame,
     closed, and the foot in the world."""
     pieces = [
@@ -41,7 +41,7 @@ def panda_pieces() -> list[list[Solid]]:
     return [*pieces, [_foot()]]
 
 
-def _parts(opening: float) -> list[tuple[int, tuple[Primitive, ...], Colour]]:
+def _parts(opening: float) -> list[tuple[int, tuple[RobotPart, ...], Colour]]:
     """The frame, the primitives and the colour of each link, of the hand and of its fingers."""
     both = fingers(opening)
     half = len(both) // 2
@@ -49,17 +49,19 @@ def _parts(opening: float) -> list[tuple[int, tuple[Primitive, ...], Colour]]:
     return [*links, (7, tuple(HAND), DARK), (7, both[:half], GREY), (7, both[half:], GREY)]
 
 
-def _foot() -> Solid:
+def _foot() -> VisibleSolid:
     start, end, radius = FOOT
     return _capsule_solid(radius, (np.array(end) - start)[2] / 2, np.eye(3), (np.array(start) + end) / 2, GREY)
 
 
-def _solid(T: np.ndarray, part: Primitive, colour: Colour) -> Solid:
+def _solid(T: np.ndarray, part: RobotPart, colour: Colour) -> VisibleSolid:
     if part.kind == "box":
-        return Solid(_BOX, np.array(part.size), T[:3, :3], T[:3, 3], colour)
+        return VisibleSolid(_BOX, np.array(part.size), T[:3, :3], T[:3, 3], colour)
     radius, half = part.size
     return _capsule_solid(radius, half, T[:3, :3], T[:3, 3], colour)
 
 
-def _capsule_solid(radius: float, half: float, rotation: np.ndarray, position: np.ndarray, colour: Colour) -> Solid:
-    return Solid(_CAPSULE, np.array([radius, radius, half + radius]), rotation, position, colour)
+def _capsule_solid(
+    radius: float, half: float, rotation: np.ndarray, position: np.ndarray, colour: Colour
+) -> VisibleSolid:
+    return VisibleSolid(_CAPSULE, np.array([radius, radius, half + radius]), rotation, position, colour)

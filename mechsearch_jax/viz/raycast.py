@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mechsearch_jax.shapes.primitives import Primitive
 from mechsearch_jax.workspace.camera import Camera
-
-if TYPE_CHECKING:
-    import trimesh
 
 # A solid nearer to the camera's plane than this is cast in the whole image [m].
 NEAREST = 0.02
@@ -28,22 +25,8 @@ RAYS = 2
 Colour = tuple[float, float, float]
 
 
-class Surface(Protocol):
-    """The methods of `shapes.Shape` that ray casting needs; `Capsule` has them, too."""
-
-    def cut(
-        self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
-    ) -> Float[Any, "*rays"]: ...
-
-    def normal(
-        self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
-    ) -> Float[Any, "*batch 3"]: ...
-
-    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh: ...
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
-class Solid:
+class VisibleSolid:
     """A visible solid.
 
     Attributes:
@@ -54,7 +37,7 @@ class Solid:
       colour: red, green and blue, 0 to 1.
     """
 
-    surface: Surface
+    surface: Primitive
     half_size: Float[np.ndarray, " 3"]
     rotation: Float[np.ndarray, "3 3"]
     position: Float[np.ndarray, " 3"]
@@ -112,7 +95,7 @@ class Eye:
         colour = np.broadcast_to(self._background, (*shape, 3)).copy()
         return Picture(np.full(shape, np.inf, np.float32), colour)
 
-    def picture(self, solids: Iterable[Solid], behind: Picture | None = None) -> Picture:
+    def picture(self, solids: Iterable[VisibleSolid], behind: Picture | None = None) -> Picture:
         """A picture of solids, merged by depth with the picture `behind`."""
         start = behind or self.empty()
         picture = Picture(start.depth.copy(), start.colour.copy())
@@ -121,7 +104,7 @@ class Eye:
             self._draw(solid, picture)
         return picture
 
-    def _draw(self, solid: Solid, picture: Picture) -> None:
+    def _draw(self, solid: VisibleSolid, picture: Picture) -> None:
         window = self._window(solid)
         if window is None:
             return
@@ -143,7 +126,7 @@ class Eye:
         picture.depth[window][nearer] = depth
         picture.colour[window][nearer] = shade[:, None] * np.array(solid.colour, np.float32)
 
-    def _window(self, solid: Solid) -> tuple[slice, slice] | None:
+    def _window(self, solid: VisibleSolid) -> tuple[slice, slice] | None:
         """The part of the image that contains a solid's bounding box; None if that is outside."""
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
         corners = (signs * solid.half_size) @ np.asarray(solid.rotation).T + solid.position

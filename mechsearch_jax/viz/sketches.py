@@ -13,9 +13,9 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.path import Path
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.robot.gripper import HAND, Primitive, fingers
+from mechsearch_jax.robot.gripper import HAND, RobotPart, fingers
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
@@ -109,7 +109,7 @@ def points_of_hand(T: Float[np.ndarray, "4 4"], opening: float) -> list[Float[np
     return [_corners(T, parts) for parts in (both[:half], both[half:], HAND)]
 
 
-def _corners(T: np.ndarray, parts: Sequence[Primitive]) -> np.ndarray:
+def _corners(T: np.ndarray, parts: Sequence[RobotPart]) -> np.ndarray:
     """Corners of boxes given in a frame with the pose `T`."""
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     poses = [T @ part.T_frame_primitive for part in parts]

@@ -20,7 +20,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.filmstrip import Frame, draw_seen
-from mechsearch_jax.viz.raycast import Solid
+from mechsearch_jax.viz.raycast import VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -62,7 +62,7 @@ class Mesh(NamedTuple):
     faces: UInt32[np.ndarray, "triangles 3"]
 
 
-def mesh_of(solids: Iterable[Solid]) -> Mesh:
+def mesh_of(solids: Iterable[VisibleSolid]) -> Mesh:
     """One mesh of several solids, in the frame of their poses."""
     parts = []
     for solid in solids:

@@ -1,32 +1,39 @@
-"""The target, whose shape is known, and the finite set of its candidate poses (paper section 3)."""
+"""The target, whose shape is known, the finite set of its candidate poses (paper section 3), and its files."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import os
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.files import PathLike, read_json
 from mechsearch_jax.runtime.identity import Uncompared
-from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents
+from mechsearch_jax.shapes import shape_of, union
+from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents, solids
 from mechsearch_jax.shapes.meshes import LEAST_THICKNESS, thickness
-from mechsearch_jax.shapes.solid import SingleShape, Solid, Union
-from mechsearch_jax.workspace.compound_file import format_compound, parse_compound
+from mechsearch_jax.shapes.parts import part_rows
+from mechsearch_jax.shapes.solid import Solid, solid_of
+from mechsearch_jax.workspace.scenario import Body, check_norm, format_compound, is_compound, numbers, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target_data import TargetData, target_data
 
-if TYPE_CHECKING:
-    from mechsearch_jax.workspace.scenario import Body
-
+# The number of planes of all polyhedra is rounded up to a multiple of this, and is at least so large: that of eight
+# polyhedra of 48 vertices.
+PLANES = 768
 # Largest half-extent and inset [m], and largest number of candidate poses.
 LARGEST = 1.0
 MOST_POSES = 100_000
@@ -34,6 +41,109 @@ MOST_POSES = 100_000
 UPRIGHT = math.cos(math.radians(5))
 # What a target of pieces or of a mesh is made of, if nothing is said: density [kg/m3] and friction.
 DENSITY, FRICTION = 600.0, 0.5
+# The key that says how the body has to be turned to stand upright.
+TURN = "quaternion"
+
+
+class TargetData(flax.struct.PyTreeNode):
+    """The geometry of a target of pieces, in the frame of its centre of mass.
+
+    Attributes:
+      planes: of the faces of its polyhedra, one polyhedron after the other, rows (n, d) of n . x <= d, shape (F, 4)
+        [m]; rows beyond `count` mean nothing.
+      last: whether a plane is the last of its polyhedron, shape (F,).
+      count: number of planes.
+      half_size: half-extents of the smallest box about the origin, shape (3,) [m].
+      middle, half: of the smallest box around it, shape (3,) [m].
+      bottom, top, radius: of the `Solid` [m].
+      parts: of `parts.part_rows`.
+      number: that identifies the compound.
+      turn, round: of the `Solid`; static.
+      primitives: its pieces that are no polyhedra; static, for they are few.
+    """
+
+    planes: Any
+    last: Any
+    count: Any
+    half_size: Any
+    middle: Any
+    half: Any
+    bottom: Any
+    top: Any
+    radius: Any
+    parts: tuple[Any, ...]
+    number: Any
+    turn: float = flax.struct.field(pytree_node=False)
+    round: bool = flax.struct.field(pytree_node=False)
+    primitives: tuple[Piece, ...] = flax.struct.field(pytree_node=False)
+
+    def is_of(self, compound: Compound | None) -> bool:
+        """Whether these are the arrays of a compound; False inside of a program."""
+        number = self.number
+        if not isinstance(number, np.ndarray | np.generic | jax.Array) or isinstance(number, Tracer):
+            return False
+        return np.ndim(number) == 0 and compound is not None and int(number) == _number(compound)
+
+    def cut(self, origin: Sequence[Any], direction: Sequence[Any]) -> Float[jax.Array, "*rays"]:
+        """Where rays from outside enter it, as `union.cut` of the compound."""
+        shape = np.broadcast_shapes(origin[0].shape, direction[0].shape)
+        first = jnp.full(shape, jnp.inf)
+        if self.primitives:
+            static = Compound(self.primitives, 1.0, 1.0)
+            first = jnp.minimum(first, union.cut(static, origin, direction, 0.0, jnp))
+        if self.planes.shape[-2] == 0:
+            return first
+
+        planes, last = jnp.asarray(self.planes), jnp.asarray(self.last)
+
+        def of_plane(i, state):
+            near, far, first = state
+            near, far = union.crossed(planes[i, :3], planes[i, 3], origin, direction, (near, far), jnp)
+            ends = last[i]
+            first = jnp.where(ends, jnp.minimum(first, union.entry(near, far, jnp)), first)
+            return jnp.where(ends, jnp.inf, near), jnp.where(ends, 0.0, far), first
+
+        start = jnp.full(shape, jnp.inf), jnp.zeros(shape), first
+        return jax.lax.fori_loop(0, self.count, of_plane, start)[2]
+
+
+@functools.lru_cache(maxsize=64)
+def target_data(compound: Compound) -> TargetData:
+    """The arrays of a compound, which is centred; they must not be changed."""
+    half_size = half_extents(compound)
+    whole = solid_of(compound, half_size)
+    rows = union.polyhedra(compound)
+    planes, last = np.zeros((0, 4)), np.zeros(0, bool)
+    if rows is not None:
+        there = rows.offset < union.FAR
+        planes = np.column_stack([rows.normal[there], rows.offset[there]])
+        last = np.concatenate([np.arange(n) == n - 1 for n in there.sum(axis=1)])
+    room = max(math.ceil(len(planes) / PLANES), 1) * PLANES if len(planes) else 0
+    count = len(planes)
+    planes = np.pad(planes, ((0, room - count), (0, 0)))
+    against, along = whole.extent(np.eye(3), np)
+    return TargetData(
+        planes=planes.astype(np.float32),
+        last=np.pad(last, (0, room - count)),
+        count=np.int32(count),
+        half_size=np.array(half_size, np.float32),
+        middle=((along - against) / 2).astype(np.float32),
+        half=((along + against) / 2).astype(np.float32),
+        bottom=np.float32(whole.bottom),
+        top=np.float32(whole.top),
+        radius=np.float32(whole.radius),
+        parts=part_rows(compound),
+        number=np.int32(_number(compound)),
+        turn=whole.turn,
+        round=whole.round,
+        primitives=tuple(solid for solid in solids(compound.pieces) if solid.shape != CONVEX),
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _number(compound: Compound) -> int:
+    """A number that differs between compounds."""
+    return zlib.crc32(repr(compound).encode()) >> 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,7 +282,8 @@ class Target:
             )
         # Its colour is the detector's, whatever the compound's own.
         compound = dataclasses.replace(centred(compound)[0], colour=None)
-        return cls(COMPOUND, half_extents(compound), yaws=Union(compound).yaws, compound=compound)
+        half_size = half_extents(compound)
+        return cls(COMPOUND, half_size, yaws=solid_of(compound, half_size).yaws, compound=compound)
 
     def like(self, other: Target) -> Target:
         """Another target with this one's grid and inset.
@@ -209,7 +320,7 @@ class Target:
     def solid(self) -> Solid:
         """Its geometry."""
         assert self.traced is None, "inside of a program a target of pieces is data"
-        return Union(self.compound) if self.compound else SingleShape(shape_of(self.shape), self.half_size)
+        return solid_of(self.compound or shape_of(self.shape), self.half_size)
 
     @property
     def is_compound(self) -> bool:
@@ -225,29 +336,33 @@ class Target:
         return target_data(self.compound)
 
     @property
+    def _extents(self) -> Solid | TargetData:
+        return self.solid if self.traced is None else self.traced
+
+    @property
     def turn(self) -> float:
         """The yaw after which it looks the same [rad]: half a turn, or a full one."""
-        return self.solid.turn if self.traced is None else self.traced.turn
+        return self._extents.turn
 
     @property
     def round(self) -> bool:
         """Whether it is a solid of revolution about its vertical axis."""
-        return self.solid.round if self.traced is None else self.traced.round
+        return self._extents.round
 
     @property
     def bottom(self) -> float | Array:
         """How far its lowest point is below its centre [m]."""
-        return self.solid.bottom if self.traced is None else self.traced.bottom
+        return self._extents.bottom
 
     @property
     def top(self) -> float | Array:
         """How far its highest point is above its centre [m]."""
-        return self.solid.top if self.traced is None else self.traced.top
+        return self._extents.top
 
     @property
     def radius(self) -> float | Array:
         """Largest distance of a point from the vertical axis through its centre [m]."""
-        return self.solid.radius if self.traced is None else self.traced.radius
+        return self._extents.radius
 
     @property
     def tall(self) -> float | Array:
@@ -342,3 +457,50 @@ def _unflattened(static: Any, children: tuple[TargetData, ...]) -> Target:
 
 
 jax.tree_util.register_pytree_node(Target, _flattened, _unflattened)
+
+
+def load_target(path: PathLike, scale: float = 1.0) -> Target:
+    """The target that a file describes, with the usual candidate poses.
+
+    A JSON file holds a body of a scenario file: `pieces` or `mesh` with `density` and `friction`, perhaps `color` and
+    `scale`, and no place; `quaternion` turns it upright, z up, if it is not already. Any other file is a mesh, z up.
+
+    Args:
+      path: of the file. For meshes see `meshes.convex_pieces`.
+      scale: metres per unit of a mesh; in a JSON file that is a key.
+
+    Raises:
+      InputError: the file cannot be read, holds something else, or no target can be made of it.
+    """
+    file = Path(path)
+    if file.suffix.lower() != ".json":
+        return Target.from_mesh(file, scale)
+    value = read_json(file)
+    if not is_compound(value):
+        raise InputError(f"{file}: must be a JSON object with pieces or mesh, density and friction")
+    if scale != 1.0:
+        raise InputError(f"{file}: a scale is for a mesh file; write it into this file, beside mesh")
+    turn = Rotation.identity()
+    if TURN in value:
+        quaternion = numbers(value[TURN], 4, f"{file}: {TURN}")
+        check_norm(quaternion, f"{file}: {TURN}")
+        turn = Rotation.from_quat(quaternion, scalar_first=True)
+    body = {key: entry for key, entry in value.items() if key != TURN}
+    compound = parse_compound(body, (), str(file), file.parent)
+    pieces = [_turned(piece, turn) for piece in compound.pieces]
+    return Target.from_parts(pieces, compound.density, compound.friction)
+
+
+def _turned(piece: Piece, turn: Rotation) -> Piece:
+    """A piece in a frame that is turned about the body's origin; a polyhedron has no rotation of its own."""
+    if turn.magnitude() == 0.0:
+        return piece
+    moved = dataclasses.replace(piece, position=_rounded(turn.apply(piece.position)))
+    if piece.shape == CONVEX:
+        return dataclasses.replace(moved, vertices=tuple(map(_rounded, turn.apply(piece.vertices))))
+    own = Rotation.from_quat(piece.quaternion, scalar_first=True)
+    return dataclasses.replace(moved, quaternion=_rounded((turn * own).as_quat(scalar_first=True)))
+
+
+def _rounded(values: np.ndarray) -> Any:
+    return tuple(round(float(v), 9) + 0.0 for v in values)

@@ -47,7 +47,7 @@ def looked(problem, objects, found=False, pose=(0.0, 0.0, 0.0)):
 def from_true_shapes(problem):
     """Plans in shipped scenarios, one of them tried out in physics, and the grasp of a target that stands free."""
     from mechsearch_jax.envs.episode.method import Method
-    from mechsearch_jax.planner.trials import decide
+    from mechsearch_jax.planner.step import decide, unsearched
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 
     key, method, answers = jax.random.key(0), Method(), {}
@@ -56,7 +56,8 @@ def from_true_shapes(problem):
         objects = superquadrics(scenario.objects)
         observation, belief = looked(problem, objects)
         answers[name] = described(belief, method.policy()(key, problem, belief, observation))
-    tried = decide(method.policy(), method.trials(), key, problem, belief, observation)
+    state = unsearched(problem, observation).replace(belief=belief)
+    tried = decide(method.policy(), method.trials(), key, problem, state).decision
     answers[f"{name}, tried"] = described(belief, tried)
     x, y, _ = scenario.target.position
     clear = objects.replace(valid=jnp.zeros_like(objects.valid))

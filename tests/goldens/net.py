@@ -121,9 +121,9 @@ def chosen_actions():
     """An action for each kind in the order of their codes: none, a push, a pick-and-place, taking the target out."""
     from mechsearch_jax import planner
     from mechsearch_jax.actions import ActionKind, no_action
+    from mechsearch_jax.grasping.retrieval import best_grasp
     from mechsearch_jax.observation import Observation
     from mechsearch_jax.problem.cache import cached_problem
-    from mechsearch_jax.retrieval import best_grasp
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 
     scenario = load_scenario(example_scenarios()["first-light"])

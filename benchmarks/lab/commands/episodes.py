@@ -27,8 +27,8 @@ def _command() -> str:
     return shlex.join([*PROGRAM.split(), *sys.argv[1:]])
 
 
-def _scenes(names: Sequence[str]) -> list[Scenario]:
-    """The scenes that files, folders and names stand for.
+def _scenes(command: str, names: Sequence[str]) -> list[Scenario]:
+    """The scenes that files, folders and names stand for, for a command.
 
     Raises:
       InputError: there is nothing for one of them, or two have the same name.
@@ -38,7 +38,7 @@ def _scenes(names: Sequence[str]) -> list[Scenario]:
     scenes: dict[str, Scenario] = {}
     for scene in map(load_scenario, find_scenarios(names)):
         if scene.name in scenes:
-            raise InputError(f"lab ceiling: two scenes are called {scene.name}; rename one")
+            raise InputError(f"lab {command}: two scenes are called {scene.name}; rename one")
         scenes[scene.name] = scene
     return list(scenes.values())
 
@@ -100,7 +100,7 @@ def bench_ceiling(
     config = dataclasses.asdict(effort)
     sequences = config.pop("sequences")
     at_least_one("lab ceiling", sequences=sequences, **{name: config[name] for name in config if name != "seed"})
-    scenes = _scenes(scenarios)
+    scenes = _scenes("ceiling", scenarios)
     outcomes = solvability.read_outcomes(results)
     check_writable(out)
     keep_compilations()
@@ -126,6 +126,7 @@ def bench_cell(
     /,
     *,
     out: Path,
+    scenarios: SomeScenarios = (),
     objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (2, 4, 6),
     searches: int = 20,
     seed: int = 0,
@@ -139,6 +140,7 @@ def bench_cell(
       config: what the cell is like: camera, shelf, target, base and planner.
       out: folder for a row of every search, pictures of those that were lost, and cell.json. Searches that have a
         row of the same code and configuration are not run again.
+      scenarios: scenes to search in, all with the seed, instead of random ones.
       objects: numbers of objects, taken in turn.
       searches: how many, each of a scene of its own.
       seed: of the first scene; the others follow.
@@ -156,16 +158,20 @@ def bench_cell(
         raise InputError("lab cell: --color-noise is without a number; leave it out, or give one, as 0.016")
     conditions = cell.Conditions(objects, colors, color_noise, depth_noise)
     check_writable(out)
+    if scenarios:
+        starts = [(scene.name, seed, scene) for scene in _scenes("cell", scenarios)]
+    else:
+        starts = cell.random_scenes(config, conditions, range(seed, seed + searches))
     console = Console(highlight=False)
     with console.status("preparing") as status:
 
         def progress(done: int, what: str) -> None:
-            line = f"{done}/{searches} {what}"
+            line = f"{done}/{len(starts)} {what}"
             status.update(line)
             if not console.is_terminal:
                 console.print(line, soft_wrap=True)
 
-        rows = cell.run_cell(config, out, conditions, range(seed, seed + searches), progress)
+        rows = cell.run_cell(config, out, conditions, starts, progress)
     cell.save_rows(rows, config, conditions, _command(), out / "cell.json")
     console.print(cell.cell_table(rows))
     console.print(str(out / "cell.json"), soft_wrap=True)

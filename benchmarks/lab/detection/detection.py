@@ -19,17 +19,19 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing
-from mechsearch_jax.envs.camera.recognisers import ColourRecogniser, recogniser, sighted
+from mechsearch_jax.envs.camera.recognisers import ImageRecogniser, recogniser
 from mechsearch_jax.envs.camera.sensing import Sensing
-from mechsearch_jax.envs.camera.simulated_camera import target_pixels
+from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
+from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.mismatch import USUAL_HUE_GAP
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario
 from mechsearch_jax.images.cloud import thinned_view
 from mechsearch_jax.images.colour import RED, TargetColour
+from mechsearch_jax.images.detection import ColouredDepth, detect
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -153,7 +155,7 @@ def _free_places(world: World, rng: np.random.Generator, shelf: Shelf) -> Iterab
 
 @functools.partial(jax.jit, static_argnames=("eyes", "camera", "shelf"))
 def _looks(
-    eyes: ColourRecogniser,
+    eyes: ImageRecogniser,
     camera: Camera,
     shelf: Shelf,
     worlds: World,
@@ -166,8 +168,10 @@ def _looks(
     def look(scene):
         world, key = scene
         unseen = found_pixels(camera) / view.stride**2
-        image, _, _, detection = sighted(key, eyes, view, shelf, world, unseen, Sensing(colour=sensing))
-        truth = image.segmentation == TARGET
+        images = eyes.images(key, Snapshot(camera, shelf, world, sensing=Sensing(colour=sensing)))
+        shown = ColouredDepth(back_project(view.camera, images.depth), images.depth, images.colour)
+        detection = detect(key, eyes.core.detector, eyes.core.target, shelf, view.camera, shown, unseen)
+        truth = observe(view.camera, world, shelf).segmentation == TARGET
         counts = (jnp.sum(pixels) for pixels in (truth, detection.pixels, truth & detection.pixels))
         return target_pixels(camera, world), detection.visible, *counts
 
@@ -205,7 +209,7 @@ def detection_figures(
     seconds: list[float] = []
     for done, condition in enumerate(conditions() if measured is None else measured, 1):
         eyes = recogniser("full", target, TargetColour.lit(COLOURS[condition.target]))
-        assert isinstance(eyes, ColourRecogniser)
+        assert isinstance(eyes, ImageRecogniser)
         start = time.perf_counter()
         numbers = jax.device_get(_looks(eyes, camera, shelf, worlds, keys, condition.sensing))
         seconds.append((time.perf_counter() - start) / count)

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import qmc
 
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval
-from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
+from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.scenes.household import household
@@ -32,6 +32,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import View
 from mechsearch_jax.perception.explanation import Fitter, as_segmented
 from mechsearch_jax.perception.parts.in_parts import InParts
+from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.problem.workcell import Workcell
@@ -264,7 +265,7 @@ class BodiesBench:
         world = from_scenario(scenario)
         snapshot = Snapshot(camera, shelf, world)
         seeing: Any = recogniser("masks", self.workcell.target)
-        image = labelled(key, seeing, snapshot.view, shelf, world, snapshot.target_seen)
+        image, _, _ = labelled(seeing.core, key, camera, snapshot.view, shelf, seeing.images(key, snapshot))
         alone = [
             int((observe(snapshot.view.camera, _only(world, slot), shelf).segmentation == slot).sum())
             for slot in range(len(scenario.objects))

@@ -23,7 +23,7 @@ from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World, from_scenario, true_superquadrics
 from mechsearch_jax.planner import Problem, build_problem, initial_belief

@@ -93,7 +93,7 @@ class CellRow:
     """The result of one search.
 
     Attributes:
-      seed, objects: of the scene.
+      seed, objects: of the search and its scene.
       colour, colour_noise: of the target, red, green and blue in 0 to 1, and of the camera.
       retrieved: whether the target was taken out and nothing fell off the board.
       found_step: number of motions before the target was first seen; None if it never was.
@@ -109,6 +109,7 @@ class CellRow:
       actions: kinds of the motions.
       seconds: of each look and decision [s].
       error: the traceback of an exception; None without one.
+      scene: its name.
     """
 
     seed: int
@@ -129,6 +130,7 @@ class CellRow:
     seconds: tuple[float, ...]
     error: str | None = None
     misplaced: int | None = None
+    scene: str = ""
 
 
 def run_search(
@@ -248,21 +250,22 @@ def _inside(
     return np.all(np.abs((points - centre) @ rotation) <= np.maximum(half, 0.0), axis=1)
 
 
-def scenes(settings: Settings, conditions: Conditions, seeds: Iterable[int]) -> list[tuple[int, Scenario]]:
-    """Scenes with a hidden target in a cell, with their seeds.
+def random_scenes(config: Path, conditions: Conditions, seeds: Iterable[int]) -> list[tuple[str, int, Scenario]]:
+    """Scenes with a hidden target in the cell of a configuration file, with their names and seeds.
 
     Raises:
-      InputError: no target can be hidden in the cell.
+      InputError: the file is wrong, or no target can be hidden in its cell.
     """
-    generator = ScenarioGenerator.of(settings)
-    return [(seed, generator.generate(seed, conditions.count(seed))) for seed in seeds]
+    generator = ScenarioGenerator.of(load_settings(config))
+    scenes = [(seed, generator.generate(seed, conditions.count(seed))) for seed in seeds]
+    return [(f"{seed}-{len(scene.objects)}", seed, scene) for seed, scene in scenes]
 
 
 def run_cell(
     config: Path,
     out: Path,
     conditions: Conditions,
-    seeds: Sequence[int],
+    starts: Sequence[tuple[str, int, Scenario]],
     on_progress: Callable[[int, str], None] = lambda done, next_search: None,
 ) -> list[CellRow]:
     """Run searches in the cell of a configuration file; those with a row in the folder are not run again.
@@ -271,7 +274,7 @@ def run_cell(
       config: the file.
       out: folder for a row of every search, and pictures of those that failed.
       conditions: what differs from search to search.
-      seeds: of the scenes.
+      starts: name, seed and scene of each search.
       on_progress: called with the number of searches so far, and a description of the next.
 
     Raises:
@@ -286,23 +289,24 @@ def run_cell(
     keep_compilations()
     rows = []
     on_progress(0, "preparing")
-    for number, (seed, scenario) in enumerate(scenes(settings, conditions, seeds)):
-        file = out / f"search-{seed}-{len(scenario.objects)}.json"
+    for number, (name, seed, scenario) in enumerate(starts):
+        file = out / f"search-{name}.json"
         if file.is_file():
             rows.append(_read_row(file, identity))
             continue
-        on_progress(number, f"{len(scenario.objects)} objects, seed {seed}")
+        on_progress(number, f"{name}: {len(scenario.objects)} objects, seed {seed}")
         steps: list[SearchStep] = []
         own = conditions.settings(settings, seed)
         noise, colour = conditions.noise(seed), own.workcell.colour
         cell = SimulatedCell(own.workcell, scenario, noise=noise, target_colour=colour, seed=seed)
         row = run_search(searcher_of(own, seed=seed), cell, seed, own.config.max_steps + 1, steps.append)
+        row = dataclasses.replace(row, scene=scenario.name)
         if steps and not row.retrieved:
             for step in steps:
-                step.picture.savefig(out / f"search-{seed}-{step.index}.png")
+                step.picture.savefig(out / f"search-{name}-{step.index}.png")
         save_json({**identity, "row": dataclasses.asdict(row)}, file)
         rows.append(row)
-    on_progress(len(seeds), "done")
+    on_progress(len(starts), "done")
     return rows
 
 

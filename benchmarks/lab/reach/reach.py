@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.geometry.transforms import compose, upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import GraspTables, grasp_tables
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import GraspTables, grasp_tables
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.entry import FEW_CROSSINGS, way_in
 from mechsearch_jax.robot.gripper import Gripper, joints_hit_shelf

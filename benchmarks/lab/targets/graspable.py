@@ -26,21 +26,21 @@ from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.benchmarks.lab.targets.antipodal import Approaches, gripper_poses, lines
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
-from mechsearch_jax.candidate_pairs import is_grasp
 from mechsearch_jax.envs.trials.native import NativeTrials, TrialSetup
 from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.grasping.graspability import is_grasp
+from mechsearch_jax.grasping.retrieval import GraspChoice, TargetGrasps, found_grasps, target_grasps, top_grasps
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
 from mechsearch_jax.problem.settings import Settings
-from mechsearch_jax.retrieval import GraspChoice, TargetGrasps, found_grasps, target_grasps, top_grasps
 from mechsearch_jax.robot.entry import ways_in
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes.compound import centred
-from mechsearch_jax.workspace.compound_file import parse_compound
+from mechsearch_jax.workspace.scenario import parse_compound
 from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
 
 # Where targets stand: x and y [m], as objects of generated scenes.

@@ -6,7 +6,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Kind, Sketch
 from mechsearch_jax.actions.types import Action, Prediction
 
 CODE = 0
@@ -26,23 +26,15 @@ def no_action() -> Action:
 
 
 @dataclasses.dataclass(frozen=True)
-class Nothing:
-    """A `kind.Kind`."""
+class Nothing(Kind):
+    """Doing nothing."""
 
     code: int = CODE
     name: str = "none"
-    moves_object: bool = False
-    holds_object: bool = False
-    takes_target: bool = False
-    returns_home: bool = False
 
     def predict(self, space, push_model, scene, untouchable, action, wrist) -> Prediction:
         """Nothing changes; marked impossible, since it achieves nothing."""
         return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
-
-    def reference(self, action, config) -> None:
-        """No motion."""
-        return None
 
     def sketch(self, scene, after, action) -> Sketch:
         """Nothing to show."""

@@ -19,10 +19,10 @@ from mechsearch_jax.actions.approach import (
     swept_places,
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace
+from mechsearch_jax.actions.kind import SampledKind, Sketch
 from mechsearch_jax.actions.kinds.object_grasps import grasp_variants, object_grasps
 from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
-from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
+from mechsearch_jax.actions.types import Action, Candidates, DrawnCandidate, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.rigid import held_pose, pick_and_place
 from mechsearch_jax.geometry.bodies import slimmed
@@ -54,14 +54,13 @@ def _object_hits(T, owner, held, scene, clouds, distance, mask):
 
 
 @dataclasses.dataclass(frozen=True)
-class PickAndPlace:
-    """A `kind.SampledKind`: a side grasp, and a random free place."""
+class PickAndPlace(SampledKind):
+    """A side grasp, and a random free place."""
 
     code: int = CODE
     name: str = "pick-and-place"
     moves_object: bool = True
     holds_object: bool = True
-    takes_target: bool = False
     returns_home: bool = True
     opening: int = OPEN
     surrounds_object: bool = True
@@ -103,7 +102,9 @@ class PickAndPlace:
         T = candidates.T_world_gripper.reshape(-1, 4, 4)
         return approach_enters(space.tables, possible, cloud, T, usable.reshape(-1)).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, scene, possible, candidates, drawn: DrawnCandidate) -> Draft:
+    def draft(
+        self, key, space: ActionSpace, scene, possible, candidates, drawn: DrawnCandidate
+    ) -> tuple[Array, Sample]:
         """The grasp, a place where the object can be put, and the poses of gripper and object at both ends."""
         index, number = drawn.object, jnp.clip(drawn.number, 0, candidates.reached.shape[1] - 1)
         T, wrist = candidates.T_world_gripper[index, number], jnp.asarray(self.wrists(space))[number]
@@ -118,7 +119,7 @@ class PickAndPlace:
             opening=jnp.float32(space.gripper.max_opening),
         )
         grippers = jnp.stack([T, *[T_place] * (PLACES - 1)])
-        return Draft(placed, action, wrist, grippers, jnp.broadcast_to(T_object, (PLACES, 4, 4)))
+        return placed, Sample(action, wrist, grippers, jnp.broadcast_to(T_object, (PLACES, 4, 4)))
 
     def predict(self, space, push_model, scene, untouchable, action: Action, wrist) -> Prediction:
         """The object, turned in the hand, moves with the gripper; `draft` has tested that it can."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.kind import Kind, Sketch
 from mechsearch_jax.actions.types import Action, Prediction
 from mechsearch_jax.robot.motion import MotionConfig, Reference, retrieve_reference
 
@@ -41,15 +41,12 @@ def retrieve_action(
 
 
 @dataclasses.dataclass(frozen=True)
-class Retrieve:
-    """A `kind.Kind`; `retrieval` chooses the grasp."""
+class Retrieve(Kind):
+    """Taking the target out; `retrieval` chooses the grasp."""
 
     code: int = CODE
     name: str = "retrieve"
-    moves_object: bool = False
-    holds_object: bool = False
     takes_target: bool = True
-    returns_home: bool = False
 
     def predict(self, space, push_model, scene, untouchable, action, wrist) -> Prediction:
         """A retrieval that hits nothing leaves all objects where they are."""

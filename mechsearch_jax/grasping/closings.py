@@ -16,18 +16,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from mechsearch_jax.robot.gripper import FINGER, Gripper, Primitive, primitives_in_gripper
+from mechsearch_jax.robot.gripper import FINGER, Gripper, RobotPart, primitives_in_gripper
+from mechsearch_jax.robot.pads import between
 from mechsearch_jax.shapes.compound import Compound
-from mechsearch_jax.shapes.field import Field, field_of
 from mechsearch_jax.shapes.solid import surface
+from mechsearch_jax.shapes.union import Field, field_of
 
 # Directions of the approach over a full turn, and the most closings of a body.
 DIRECTIONS, MOST = 24, 16
 # Heights of closings, least distance from the body's lowest and highest points, and steps of the depth along the
 # approach and along a line [m].
 HEIGHTS, FROM_BOTTOM, FROM_TOP, DEPTH, ALONG = 7, 0.012, 0.005, 0.004, 0.001
-# Half the width of a finger's pad, and how far it reaches before and behind the line [m]; lines across it either way.
-PAD, PAD_FRONT, PAD_BACK, PAD_LINES = 0.0095, 0.006, 0.012, 5
 # Surface this far from where a pad comes to rest touches it [m]; the least share of the pads' lines that do; and the
 # largest angles between the closing direction and the surface's normal there, and the line of the forces [rad].
 TOUCH, LEAST_CONTACT, FACING = 0.0015, 0.2, math.radians(14)
@@ -173,36 +172,6 @@ def _at_height(field: Field, gripper: Gripper, yaw: float, z: float, usual: floa
             yield _Line(yaw, centre, min(float(share), ENOUGH) - OFF_AXIS * off_axis - OFF_HEIGHT * off_height)
 
 
-def _pad_lines(R_body_gripper: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch l 3"]:
-    """Where lines across the pads start from the point between the finger tips [m]."""
-    wide, deep = np.linspace(-PAD, PAD, PAD_LINES), np.linspace(-PAD_BACK, PAD_FRONT, PAD_LINES)
-    places = np.stack(np.meshgrid(wide, deep, indexing="ij"), axis=-1).reshape(-1, 2)
-    return places @ np.swapaxes(R_body_gripper[..., ::2], -1, -2)
-
-
-def between(
-    field: Field, R_body_gripper: Float[np.ndarray, "*batch 3 3"], point: Float[np.ndarray, "*batch 3"], opening: float
-) -> tuple[Float[np.ndarray, "*batch l 2"], Float[np.ndarray, "*batch l 3"]]:
-    """What is between open fingers: the first and last material on lines across the pads, from the middle of the
-    fingers, NaN where there is none [m]; and where the lines start [m]."""
-    across = R_body_gripper[..., None, None, :, 1]
-    starts = point[..., None, :] + _pad_lines(R_body_gripper)
-    lateral = np.arange(-opening / 2, opening / 2 + ALONG / 2, ALONG)
-    material = np.less(field.at(starts[..., None, :] + lateral[:, None] * across), 0.0)
-    there = np.any(material, axis=-1)
-    ends = np.stack([lateral[material.argmax(axis=-1)], lateral[::-1][material[..., ::-1].argmax(axis=-1)]], axis=-1)
-    return np.where(there[..., None], ends, np.nan), starts
-
-
-def grip_between(compound: Compound, T_body_gripper: Float[np.ndarray, "4 4"], opening: float) -> tuple[float, float]:
-    """Half of the width of what is between open fingers [m]: on the widest line across the pads, and between the pads
-    as they come to rest; 0 where there is nothing."""
-    ends, _ = between(field_of(compound), T_body_gripper[:3, :3], T_body_gripper[:3, 3], opening)
-    if np.isnan(ends).all():
-        return 0.0, 0.0
-    return float(np.nanmax(ends[:, 1] - ends[:, 0])) / 2, float(np.nanmax(ends[:, 1]) - np.nanmin(ends[:, 0])) / 2
-
-
 def held(
     field: Field,
     gripper: Gripper,
@@ -300,7 +269,7 @@ class OpenHand:
     @classmethod
     def of(cls, gripper: Gripper) -> OpenHand:
         """The boxes of a gripper, a little smaller than its parts."""
-        parts: Sequence[Primitive] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
+        parts: Sequence[RobotPart] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
         T = np.stack([part.T_frame_primitive for part in parts])
         return cls(np.maximum(np.array([part.size for part in parts]) - SLACK, 1e-3), T[:, :3, 3], T[:, :3, :3])
 

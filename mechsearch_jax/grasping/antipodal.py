@@ -14,13 +14,14 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mechsearch_jax.compound_grasps import BODY_POINTS, OpenHand, held
 from mechsearch_jax.geometry.spreading import farthest_points
+from mechsearch_jax.grasping.closings import BODY_POINTS, OpenHand, held
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, swept_cloud
+from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import Compound
-from mechsearch_jax.shapes.field import Field, field_of
-from mechsearch_jax.shapes.solid import Union, surface
+from mechsearch_jax.shapes.solid import surface
+from mechsearch_jax.shapes.union import Field, field_of
 
 # Angles of joint 7 relative to the usual one [rad].
 WRISTS = tuple(math.radians(30 * step) for step in range(-6, 5))
@@ -57,11 +58,11 @@ def antipodal_grasps(
     Returns:
       `T_body_gripper`, and the index in `WRISTS` of each one's angle of joint 7.
     """
-    T, bottom = _holding(compound, gripper, max_yaw), Union(compound).bottom
+    T = _holding(compound, gripper, max_yaw)
     ways = [swept_cloud(gripper, gripper.max_opening, WRIST_ORIGIN + angle, POINTS) for angle in WRISTS]
     turn, down = np.arctan2(T[:, 2, 1], T[:, 2, 0]), np.arcsin(np.clip(-T[:, 2, 2], -1.0, 1.0))
     swivel = (np.array(WRISTS) + turn[:, None] + math.pi) % (2 * math.pi) - math.pi
-    free = np.stack([_above_board(T, way, bottom) for way in ways], axis=1)
+    free = np.stack([_above_board(T, way, _bottom(compound)) for way in ways], axis=1)
     row, wrist = np.nonzero(free & ((down < LOW)[:, None] | (np.abs(swivel) < UPRIGHT)))
     features = [
         T[row, :3, 2] / APPROACH,
@@ -76,7 +77,7 @@ def antipodal_grasps(
 def _holding(compound: Compound, gripper: Gripper, max_yaw: float) -> Float[np.ndarray, "k 4 4"]:
     """Poses in which the pads hold the body, and that the open hand reaches free, above the board."""
     field, body = field_of(compound), surface(compound, BODY_POINTS)
-    hand, bottom = OpenHand.of(gripper), Union(compound).bottom
+    hand, bottom = OpenHand.of(gripper), _bottom(compound)
     middle, axis = _lines(field, surface(compound, STARTS), gripper)
     order = spread(np.hstack([middle / PLACE, (axis[:, :, None] * axis[:, None]).reshape(-1, 9) / AXIS]), LINES)
     found = [np.zeros((0, 4, 4))]
@@ -134,6 +135,11 @@ def _approaches(
     T[:, :3, :3] = np.stack([np.cross(y, z), y, z], axis=-1)
     T[:, :3, 3] = middle[line]
     return T
+
+
+def _bottom(compound: Compound) -> float:
+    """How far its lowest point is below its origin [m]."""
+    return float(union.reach(compound, np.array([0.0, 0.0, -1.0]), np))
 
 
 def _above_board(

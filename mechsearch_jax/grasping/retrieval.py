@@ -29,8 +29,8 @@ from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, transform, upright_pose
-from mechsearch_jax.grasp_config import GraspConfig
-from mechsearch_jax.graspability import INFEASIBLE, GraspTables, feasible_grasps, grasp_tables
+from mechsearch_jax.grasping.config import GraspConfig
+from mechsearch_jax.grasping.graspability import INFEASIBLE, GraspTables, feasible_grasps, grasp_tables
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses, way_in
 from mechsearch_jax.robot.gripper import Gripper

@@ -1,1 +1,0 @@
-"""Triangle surfaces: mended where they are not closed, and how far others are from them."""
