@@ -132,10 +132,12 @@ class Grab(flax.struct.PyTreeNode):
       charge: is added to the cost before the target is found.
       nearest: 0 to push the first object, 1 the one that is nearest to the robot, whatever its number. It is data, so
         that both are one program.
+      minds: 0 for costs that are all 0, as of a policy that compares none.
     """
 
     charge: float = 1.0
     nearest: float = 0.0
+    minds: float = 1.0
 
     def __call__(self, key, problem, belief, observation):
         # As the tests of the planner call it, so that it is compiled once.
@@ -158,8 +160,8 @@ class Grab(flax.struct.PyTreeNode):
         return Decision(
             action=jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp.action, push),
             value=tried[0],
-            cost=cost,
-            predicted_cost=jnp.where(able, jnp.nan, cost - 1.0),
+            cost=self.minds * cost,
+            predicted_cost=self.minds * jnp.where(able, jnp.nan, cost - 1.0),
             predicted=observation.objects,
             sequences=Sequences(
                 actions=jax.tree.map(lambda a: a[None, None], push),

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from stage import (
+from stage import Grab, (
     BOX,
     CYLINDER,
     HIDDEN,
@@ -295,11 +295,7 @@ def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
 def test_a_policy_that_compares_no_costs_is_not_said_to(problem):
     console = Console(record=True, width=200, file=io.StringIO())
     narrator = Narrator(console, console.status("begins"), problem)
-
-    def costless(*arguments):
-        return grab(*arguments).replace(cost=jnp.float32(0.0), predicted_cost=jnp.float32(0.0))
-
-    run(problem, HIDDEN, Stage(reveal), costless, watcher=narrator)
+    run(problem, HIDDEN, Stage(reveal), Grab(minds=0.0), watcher=narrator)
     first = console.export_text().split("step 2")[0]
     assert "the policy compares no costs" in first
     assert "expected" not in first
