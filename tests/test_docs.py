@@ -248,7 +248,7 @@ def test_the_times_of_a_decision_are_the_stored_ones():
     alone = "plan-farther-sides-h200.json"
     assert f"A decision takes [{1000 * stored_median(alone):.1f} ms on one H200](benchmarks/results/{alone})" in readme
     # With what is tried out.
-    files = list((ROOT / "benchmarks/results").glob("plan-farther-sides-rehearsal-*.json"))
+    files = list((ROOT / "benchmarks/results").glob("plan-farther-sides-trials-*.json"))
     assert len(files) == 2
     for file in files:
         assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme

@@ -126,14 +126,14 @@ def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_pa
 
 
 WRONG = {
-    "[target]\ncolor = [255, 0, 0]": ":2: [target] color (255.0, 0.0, 0.0) must be red, green and blue, each",
-    "[target]\n\ncolor = [1, 1, 1]": ":3: [target] color (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
-    "[target]\ncolor = {hue = 40, saturation = 0.1}": ":2: [target] color saturation 0.1 is too grey",
-    "[target]\ncolor = {hue = 400, saturation = 1}": ":2: [target] color: hue (400.0) must be from 0 to 360 degrees",
-    "[target]\ncolor = {hue = 40}": ":2: [target] color must be red, green and blue, or {hue = DEGREES",
+    "[target]\ncolor = [255, 0, 0]": ":2: [target] colour (255.0, 0.0, 0.0) must be red, green and blue, each",
+    "[target]\n\ncolor = [1, 1, 1]": ":3: [target] colour (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
+    "[target]\ncolor = {hue = 40, saturation = 0.1}": ":2: [target] colour saturation 0.1 is too grey",
+    "[target]\ncolor = {hue = 400, saturation = 1}": ":2: [target] colour: hue (400.0) must be from 0 to 360 degrees",
+    "[target]\ncolor = {hue = 40}": ":2: [target] colour must be red, green and blue, or {hue = DEGREES",
     "[target]\nhue_tolerance = 90": ":2: [target] hue_tolerance (90.0) must be from 1 to 60 degrees",
-    "[target]\ncolor = [1, 1]": ":2: [target] color must be a list of 3, not of 2",
-    "[target]\ncolour = [1, 0, 0]": ":2: [target] colour is unknown; did you mean color?",
+    "[target]\ncolor = [1, 1]": ":2: [target] colour must be a list of 3, not of 2",
+    "[target]\ncolor = [1, 0, 0]": ":2: [target] color is called colour now",
     "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
     "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base]: position x (-14.9) must be from",
     "[base]\nposition = [5, 0, 0]\n[arm]\nplace = [0.4, 0, 0]": ":4: [arm] place [-4.6, 0.0, 0.0] must be x, y and z",

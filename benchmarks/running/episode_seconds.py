@@ -107,7 +107,7 @@ def kind_of(options: Mapping[str, Any] | str) -> Kind:
 @functools.lru_cache(maxsize=4096)
 def _kind_of(configuration: str) -> Kind:
     options = json.loads(configuration)
-    trials = options.get("rehearsal", "none") != "none"
+    trials = options.get("trials", "none") != "none"
     simulator = options.get("simulator", "NativeSimulator")
     return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials, simulator)
 

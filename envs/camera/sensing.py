@@ -86,7 +86,7 @@ def sensing_of(mismatch: Mismatch, cell: TrueCell) -> Sensing | None:
     if mismatch.measures_otherwise:
         noise = OtherNoise(*(np.asarray(n, np.float32) for n in (mismatch.depth_noise, mismatch.missing_depth)))
     if mismatch.colours_otherwise:
-        numbers = (mismatch.color_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
+        numbers = (mismatch.colour_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
         colour = ColourSensing(*(np.asarray(n, np.float32) for n in numbers))
     if mismatch.resizes:
         sizes = np.asarray(cell.seen_size[:TARGET], np.float32)

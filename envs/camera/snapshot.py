@@ -222,7 +222,7 @@ def _seen_objects(snapshot: Snapshot) -> tuple[Superquadrics, Bool[Array, ""], F
     if snapshot.sensing is not None and snapshot.sensing.noise is not None:
         raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
     if snapshot.sensing is not None and snapshot.sensing.colour is not None:
-        raise InputError("color_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
+        raise InputError("colour_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
     objects = as_seen(resized(objects_on_the_board(snapshot), snapshot.sensing), snapshot.sensing)
     if snapshot.sensing is None or snapshot.sensing.holes is None:
         return objects, jnp.array(True), None

@@ -86,7 +86,7 @@ def planner(settings: Settings) -> Iterator[Finding]:
     """The planner's settings in this cell."""
     config = settings.config
     says = (
-        f"preset {settings.preset}, rehearsal {config.rehearsal}, push model {config.push_model}, "
+        f"preset {settings.preset}, trials {config.trials}, push model {config.push_model}, "
         f"at most {config.max_steps} actions"
     )
     yield Finding("planner", State.FINE, says)

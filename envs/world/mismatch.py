@@ -60,7 +60,7 @@ class Mismatch:
         shift [m], and a turn [degrees] about the middle of the board.
       depth_noise: standard deviation of the measured points' distance from the true ones [m].
       missing_depth: share of pixels without a measurement, below 1.
-      color_noise: standard deviation of each channel of the colour image, in shares of full brightness.
+      colour_noise: standard deviation of each channel of the colour image, in shares of full brightness.
       exposure: factor on all channels of the colour image.
       white_balance: share by which red is too strong in it and blue too weak.
       hue_gap: least difference of the objects' hues from the target's [degrees]; 0 for any colour.
@@ -87,9 +87,9 @@ class Mismatch:
     shelf_turn: float = option(0.0, "by how much the shelf is turned about its middle [degrees]")
     depth_noise: float = option(USUAL_NOISE, "standard deviation of the simulated depth camera's noise [m]")
     missing_depth: float = option(0.0, "share of pixels for which no depth is measured")
-    color_noise: float = option(USUAL_COLOUR_NOISE, "standard deviation of the simulated color camera's noise, 0 to 1")
-    exposure: float = option(1.0, "factor on the brightness of the simulated color image")
-    white_balance: float = option(0.0, "share by which red is too strong and blue too weak in the color image")
+    colour_noise: float = option(USUAL_COLOUR_NOISE, "standard deviation of the colour camera's noise, from 0 to 1")
+    exposure: float = option(1.0, "factor on the brightness of the simulated colour image")
+    white_balance: float = option(0.0, "share by which red is too strong and blue too weak in the colour image")
     hue_gap: float = option(USUAL_HUE_GAP, "least difference of the objects' hues from the target's [degrees]")
     holes: HolesName = option(
         "none", "what the simulated depth camera does not measure, in connected holes", get_args(HolesName)
@@ -109,7 +109,7 @@ class Mismatch:
             ("shelf_turn", 0.0, STEEPEST, "degrees"),
             ("depth_noise", 0.0, 1.0, "m"),
             ("missing_depth", 0.0, 0.99, ""),
-            ("color_noise", 0.0, 1.0, ""),
+            ("colour_noise", 0.0, 1.0, ""),
             ("exposure", 0.01, 100.0, ""),
             ("white_balance", -0.9, 0.9, ""),
             ("hue_gap", 0.0, 180.0, "degrees"),
@@ -145,7 +145,7 @@ class Mismatch:
     def colours_otherwise(self) -> bool:
         """Whether the colour image differs from the usual."""
         usual = USUAL_COLOUR_NOISE, 1.0, 0.0, USUAL_HUE_GAP
-        return (self.color_noise, self.exposure, self.white_balance, self.hue_gap) != usual
+        return (self.colour_noise, self.exposure, self.white_balance, self.hue_gap) != usual
 
     @property
     def simulates_otherwise(self) -> bool:
@@ -173,7 +173,7 @@ class Mismatch:
             )
         if recognition not in ("full", "full-parts") and self.colours_otherwise:
             raise InputError(
-                "--color-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
+                "--colour-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
             )
         if engine != "NativeSimulator" and self.physics != "usual":
             raise InputError("--world-physics: the batch simulator has the usual physics; add --simulator native")

@@ -163,10 +163,10 @@ BOXES = {
     "planner": "How the next action is chosen.",
     "world": "How the simulated world differs from what the planner assumes.",
 }
-_SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "rehearsal", "max_steps")
+_SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "trials", "max_steps")
 _RECOGNITION = (
     *("recognition", "depth_noise", "missing_depth", "holes"),
-    *("color_noise", "exposure", "white_balance", "hue_gap"),
+    *("colour_noise", "exposure", "white_balance", "hue_gap"),
 )
 
 

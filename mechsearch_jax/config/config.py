@@ -22,7 +22,7 @@ from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 
-RehearsalName = Literal["none", "physics", "learning"]
+TrialsName = Literal["none", "physics", "learning"]
 
 
 class Weights(NamedTuple):
@@ -143,7 +143,7 @@ class Config:
       problem: how the problem is built.
       planner: how the planner decides.
       push_model: name of a push model; see `dynamics.named`, and `envs.pushing.push_models` for "physics".
-      rehearsal: name of what tries actions before one is executed; see `envs.trials`. The paper tries nothing.
+      trials: name of what tries actions before one is executed; see `envs.trials`. The paper tries nothing.
       max_steps: T, actions in an episode.
     """
 
@@ -154,17 +154,17 @@ class Config:
         "what predicts pushes: a network, geometry, or simulating them, on a CPU only those that come first",
         get_args(PushModelName),
     )
-    rehearsal: RehearsalName = option(
+    trials: TrialsName = option(
         "physics",
         "what tries the best few actions out before one is made: nothing, a simulation, one that learns the friction",
-        get_args(RehearsalName),
+        get_args(TrialsName),
     )
     max_steps: int = option(10, "actions in an episode")
 
     def __post_init__(self):
         check_name(self.push_model)
-        if self.rehearsal not in get_args(RehearsalName):
-            raise InputError(f'rehearsal "{self.rehearsal}" is unknown; use {", ".join(get_args(RehearsalName))}')
+        if self.trials not in get_args(TrialsName):
+            raise InputError(f'trials "{self.trials}" is unknown; use {", ".join(get_args(TrialsName))}')
         if self.max_steps < 1:
             raise InputError(f"max_steps {self.max_steps} must be at least 1")
 

@@ -146,14 +146,14 @@ class TargetColour:
         check_range("TargetColour: hue_tolerance", tolerance, 1.0, LARGEST_HUE, "degrees")
         if len(rgb) != 3 or not all(0 <= c <= 1 for c in rgb):
             raise InputError(
-                f"TargetColour: color {tuple(rgb)} must be red, green and blue, each from 0 to 1; divide 8-bit values "
+                f"TargetColour: colour {tuple(rgb)} must be red, green and blue, each from 0 to 1; divide 8-bit values "
                 "by 255"
             )
         spread = max(rgb) - min(rgb)
         if spread < LEAST_TARGET_CHROMA or spread < LEAST_TARGET_SATURATION * max(rgb):
             raise InputError(
-                f"TargetColour: color {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells the "
-                "target from other things; give masks with target_id instead"
+                f"TargetColour: colour {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells "
+                "the target from other things; give masks with target_id instead"
             )
         return cls(rgb, threshold=1.0, difference=hue_difference if tolerance == HUE else HueDifference(tolerance))
 

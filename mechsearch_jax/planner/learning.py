@@ -151,7 +151,7 @@ def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> Learn
     if not isinstance(trials, LearnsFriction):
         if probabilities:
             raise InputError(
-                "hypotheses were learned, but the trials learn nothing; give the rehearsal that it had, "
+                "hypotheses were learned, but the trials learn nothing; give the trials that it had, "
                 "such as LearningTrials(), or begin a new search"
             )
         return None
@@ -161,7 +161,7 @@ def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> Learn
     if set(probabilities) != set(trials.names):
         raise InputError(
             f"hypotheses {'; '.join(probabilities)} were learned, but the trials have {'; '.join(trials.names)}; give "
-            "the rehearsal that it had, or begin a new search"
+            "the trials that it had, or begin a new search"
         )
     values = np.array([probabilities[name] for name in trials.names])
     if not (np.isfinite(values).all() and (values >= 0.0).all() and values.sum() > 0.0):

@@ -93,7 +93,7 @@ class Searcher:
         policy: Policy | None = None,
         push_model: PushModel | None = None,
         later_push_model: PushModel | None = None,
-        rehearsal: Trials | None = None,
+        trials: Trials | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
         trajectories: TrajectoryConfig | None = None,
         view: View | None = None,
@@ -109,7 +109,7 @@ class Searcher:
             configuration and push models.
           push_model, later_push_model: predict pushes, the latter those after the first action of a sequence; by
             default the one that `config` names.
-          rehearsal: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`; by
+          trials: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`; by
             default what `config` names. With "none", the target is only taken out where nothing is touched; `check`
             and each step's reason say so.
           recogniser: makes a recogniser of a problem; it is called like `Recogniser`.
@@ -127,7 +127,7 @@ class Searcher:
         self.config = config or standard()
         self._seed = seed
         self._policy, self._trials = policy_and_trials(
-            self.config, self.workcell.shelf, policy, rehearsal, push_model, later_push_model
+            self.config, self.workcell.shelf, policy, trials, push_model, later_push_model
         )
         self._make_recogniser = recogniser
         self._trajectories = trajectories

@@ -129,8 +129,8 @@ def bench_cell(
     objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (2, 4, 6),
     searches: int = 20,
     seed: int = 0,
-    colors: Annotated[tuple[tuple[float, float, float], ...], tyro.conf.arg(metavar="R G B ...")] = (),
-    color_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SHARE ...")] = (4 / 255,),
+    colours: Annotated[tuple[tuple[float, float, float], ...], tyro.conf.arg(metavar="R G B ...")] = (),
+    colour_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SHARE ...")] = (4 / 255,),
     depth_noise: float = 0.001,
 ) -> None:
     """Search from images in a simulated cell, through a Searcher alone; status 1 where a search ended with an error.
@@ -142,8 +142,8 @@ def bench_cell(
       objects: numbers of objects, taken in turn.
       searches: how many, each of a scene of its own.
       seed: of the first scene; the others follow.
-      colors: red, green and blue of the target in 0 to 1, of several targets in turn; the file's if not given.
-      color_noise: standard deviations of every channel, as shares of full brightness, in turn.
+      colours: red, green and blue of the target in 0 to 1, of several targets in turn; the file's if not given.
+      colour_noise: standard deviations of every channel, as shares of full brightness, in turn.
       depth_noise: standard deviation of the depth [m].
     """
     from rich.console import Console
@@ -152,9 +152,9 @@ def bench_cell(
     from mechsearch_jax.runtime.files import check_writable
 
     at_least_one("lab cell", searches=searches, objects=min(objects, default=0))
-    if not color_noise:
-        raise InputError("lab cell: --color-noise is without a number; leave it out, or give one, as 0.016")
-    conditions = cell.Conditions(objects, colors, color_noise, depth_noise)
+    if not colour_noise:
+        raise InputError("lab cell: --colour-noise is without a number; leave it out, or give one, as 0.016")
+    conditions = cell.Conditions(objects, colours, colour_noise, depth_noise)
     check_writable(out)
     console = Console(highlight=False)
     with console.status("preparing") as status:

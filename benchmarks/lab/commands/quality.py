@@ -348,7 +348,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
 
 
 def bench_detection(scenarios: Scenarios, /, *, places: int = 3, seed: int = 0, out: JsonFile = None) -> None:
-    """How well the target is detected by its color, by light, noise and other things' hues: rates, and false ones.
+    """How well the target is detected by its colour, by light, noise and other things' hues: rates, and false ones.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.

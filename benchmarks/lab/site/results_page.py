@@ -253,7 +253,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "batch_ready": clock["all compiled [s]"],
         "batch_seconds": clock["last episode [s]"] - clock["all compiled [s]"],
         **{
-            f"friction_{name}": share(reached(stored.run("rehearsal-frictions-cpu", run)["episodes"], "retrieved"))
+            f"friction_{name}": share(reached(stored.run("trials-frictions-cpu", run)["episodes"], "retrieved"))
             for name, run in frictions.items()
         },
         "starts": sum(each["scenes"] for each in starts),

@@ -75,7 +75,7 @@ _ABLATIONS = (
         ABLATION_SCENES,
         (
             STANDARD,
-            Variant("no trials", {"rehearsal": "none"}),
+            Variant("no trials", {"trials": "none"}),
             Variant("collision-free grasps only", {"retrieval_contact": False}),
             Variant("a found target may be pushed", {"move_target": True}),
             Variant("preset paper", {"preset": "paper"}),
@@ -88,8 +88,8 @@ _ABLATIONS = (
         (
             Variant("learned"),
             Variant("quasi-static", {"push_model": "quasi-static"}),
-            Variant("learned, no trials", {"rehearsal": "none"}),
-            Variant("quasi-static, no trials", {"push_model": "quasi-static", "rehearsal": "none"}),
+            Variant("learned, no trials", {"trials": "none"}),
+            Variant("quasi-static, no trials", {"push_model": "quasi-static", "trials": "none"}),
         ),
     ),
     Study(
@@ -118,7 +118,7 @@ _ABLATIONS = (
         "What does it gain to learn the friction while searching, where it is and is not as assumed?",
         ABLATION_SCENES,
         tuple(
-            Variant(f"friction x {factor:g}, {label}", {"rehearsal": name, "mismatch": Mismatch(friction=factor)})
+            Variant(f"friction x {factor:g}, {label}", {"trials": name, "mismatch": Mismatch(friction=factor)})
             for factor in (1.0, 0.5, 1.4, 2.0)
             for label, name in (("assumed", "physics"), ("learned", "learning"))
         ),
@@ -152,7 +152,7 @@ _BASELINES = (
             Variant("most-occluding", policy=f"{POLICIES}.occlusion:most_occluding"),
             Variant("mctx", policy=f"{POLICIES}.tree_search:mctx"),
             Variant("preset paper", {"preset": "paper"}),
-            Variant("no trials", {"rehearsal": "none"}),
+            Variant("no trials", {"trials": "none"}),
             Variant("10 sequences", {"sequences": 10}),
             Variant("300 sequences", {"sequences": 300}),
             Variant("informed", {"recognition": "informed"}),

@@ -78,7 +78,7 @@ ROBUSTNESS: tuple[Study, ...] = (
         "friction-without-trials",
         "What if friction is not as usual, and nothing is tried out?",
         lambda factor: Mismatch(friction=factor),
-        rehearsal="none",
+        trials="none",
     ),
     _by_factor(
         "mass",
@@ -92,7 +92,7 @@ ROBUSTNESS: tuple[Study, ...] = (
         (
             Variant("as assumed"),
             *(
-                Variant(f"drawn, {label}", {"rehearsal": name, "mismatch": _EACH_DRAWN})
+                Variant(f"drawn, {label}", {"trials": name, "mismatch": _EACH_DRAWN})
                 for label, name in (("assumed", "physics"), ("learned", "learning"), ("no trials", "none"))
             ),
         ),
