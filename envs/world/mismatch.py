@@ -8,8 +8,8 @@ stand where its workcell says, and the camera to look from where its workcell sa
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Hashable, Mapping
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -79,7 +79,9 @@ class Mismatch:
     )
     physics: PhysicsName = option("usual", "contacts and time step of the simulated world", get_args(PhysicsName))
     arm_stop: float = option(
-        0.0, "joint error at which the simulated arm stops and goes back [rad]; 0.03 or more; 0: never"
+        0.0,
+        "joint error at which the simulated arm stops and goes back [degrees], 1.7 or more; 0: never",
+        least_degrees=0.2,
     )
     camera_shift: float = option(0.0, "how far the camera stands from where it is taken to be [m]")
     camera_turn: float = option(0.0, "by how much the camera is turned about itself [degrees]")
@@ -166,19 +168,19 @@ class Mismatch:
           InputError: they cannot.
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
-            raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
+            raise InputError("depth_noise and missing_depth need an image; add --recognition masks or full")
         if recognition not in ("oracle", "informed") and self.resizes:
             raise InputError(
-                "--size-spread: shapes from images are off by themselves; take --recognition oracle or informed"
+                "size_spread: shapes from images are off by themselves; take --recognition oracle or informed"
             )
         if recognition not in ("full", "full-parts") and self.colours_otherwise:
             raise InputError(
-                "--colour-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
+                "colour_noise, exposure, white_balance and hue_gap need a colour image; add --recognition full"
             )
         if engine != "NativeSimulator" and self.physics != "usual":
-            raise InputError("--world-physics: the batch simulator has the usual physics; add --simulator native")
+            raise InputError("physics: the batch simulator has the usual physics; add --simulator native")
         if engine != "NativeSimulator" and self.arm_stop:
-            raise InputError("--arm-stop: the batch simulator's arm never stops; add --simulator native")
+            raise InputError("arm_stop: the batch simulator's arm never stops; add --simulator native")
 
     def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> TrueCell:
         """The cell of an episode, constant until its end.
@@ -254,13 +256,7 @@ def _motion(shift: np.ndarray, turn: np.ndarray, pivot: np.ndarray) -> Float[np.
     return T
 
 
-def _option(field: dataclasses.Field[Any]) -> Option:
-    # `--world-...` is what is simulated, the others what is seen.
-    of_world = ("friction", "mass", "friction_spread", "mass_spread", "physics")
-    name = f"world_{field.name}" if field.name in of_world else field.name
-    choices = field.metadata["choices"]
-    return Option(name, (field.name,), str if choices else float, field.metadata["help"], choices)
-
-
-# On the command line; paths lead from a `Mismatch`.
-MISMATCH_OPTIONS: tuple[Option, ...] = tuple(map(_option, dataclasses.fields(Mismatch)))
+# By the name that `--world` has for them; paths lead from a `Mismatch`.
+MISMATCH_OPTIONS: Mapping[str, Option] = {
+    field.name: Option.of_field(field, float) for field in dataclasses.fields(Mismatch)
+}

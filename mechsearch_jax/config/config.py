@@ -20,7 +20,7 @@ from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasp_config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.options import option
+from mechsearch_jax.runtime.options import DEGREES, in_degrees, in_radians, option
 
 TrialsName = Literal["none", "physics", "learning"]
 
@@ -198,6 +198,7 @@ class Option:
       type: of a value.
       help: one line.
       choices: the values it may have; any if None.
+      least_degrees: as of `runtime.options.option`.
     """
 
     name: str
@@ -205,6 +206,31 @@ class Option:
     type: Any
     help: str
     choices: tuple[str, ...] | None
+    least_degrees: float | None = None
+
+    @classmethod
+    def of_field(cls, field: dataclasses.Field[Any], kind: Any, path: tuple[str, ...] = ()) -> Option:
+        """The option of a field that `runtime.options.option` made, of a type, at a path."""
+        about = field.metadata
+        kind = str if about["choices"] else kind
+        return cls(field.name, (*path, field.name), kind, about["help"], about["choices"], about[DEGREES])
+
+    @property
+    def values(self) -> Any:
+        """The type of its values, which are among `choices` if it has some."""
+        return Literal[self.choices] if self.choices else self.type
+
+    def inside(self, given: Any) -> Any:
+        """A value of a file or the command line as the field holds it: angles in radians.
+
+        Raises:
+          InputError: an angle was meant in radians.
+        """
+        return in_radians(self.name, given, self.least_degrees)
+
+    def outside(self, value: Any) -> Any:
+        """A field's value as files and the command line have it: angles in degrees."""
+        return value if self.least_degrees is None else in_degrees(value)
 
 
 def _at(value: Any, path: tuple[str, ...]) -> Any:
@@ -222,13 +248,7 @@ def _fields(kind: type, path: tuple[str, ...]) -> tuple[Option, ...]:
     """The options among the fields of a configuration class, in their order."""
     hints = get_type_hints(kind)
     return tuple(
-        Option(
-            field.name,
-            (*path, field.name),
-            str if field.metadata["choices"] else hints[field.name],
-            field.metadata["help"],
-            field.metadata["choices"],
-        )
+        Option.of_field(field, hints[field.name], path)
         for field in dataclasses.fields(kind)
         if "help" in field.metadata
     )

@@ -52,6 +52,14 @@ FIXED: Mapping[str, Fixed] = {
 }
 
 
+# Keys of `--world` that were options of their own, some of them with `world_` before it.
+_OF_WORLD = frozenset(
+    (
+        *("friction", "mass", "friction_spread", "mass_spread", "size_spread", "physics", "arm_stop"),
+        *("camera_shift", "camera_turn", "shelf_shift", "shelf_turn", "depth_noise", "missing_depth", "holes"),
+        *("colour_noise", "exposure", "white_balance", "hue_gap"),
+    )
+)
 # What options are called now, by the names that files and rows of earlier versions have.
 RENAMED: Mapping[str, str] = {
     "rehearsal": "trials",
@@ -69,7 +77,10 @@ def refusal(name: str) -> str | None:
     """
     given = name.partition("=")[0]
     plain = given.removeprefix("--").replace("-", "_")
-    if new := RENAMED.get(plain):
+    new = RENAMED.get(plain, plain)
+    if (key := new.removeprefix("world_")) in _OF_WORLD:
+        return f"{given} is a key of {'--world' if given.startswith('--') else '[world]'} now: {key}"
+    if new != plain:
         return f"{given} is called {'--' + new.replace('_', '-') if given.startswith('--') else new} now"
     fixed = FIXED.get(plain)
     if fixed is None:

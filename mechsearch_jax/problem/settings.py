@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
-from mechsearch_jax.config.config import OPTIONS, Config, Option
+from mechsearch_jax.config.config import OPTIONS, Config
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
@@ -110,7 +110,8 @@ def tables() -> dict[str, dict[str, Any]]:
 def load_settings(path: PathLike) -> Settings:
     """Read a configuration file (TOML); missing keys take their defaults.
 
-    Lengths in metres, angles in radians, poses in the robot's base frame, or in a frame in which `[base]` locates it.
+    Lengths in metres, angles in degrees but the joints' in radians, poses in the robot's base frame, or in a frame in
+    which `[base]` locates it.
 
     Raises:
       InputError: the file cannot be read or is not TOML; a table or key is unknown; a value is of the wrong type or
@@ -232,7 +233,7 @@ def _compound_target(document: Document, made_of: dict[str, Any]) -> Target:
 
 def _with_planner(document: Document, settings: Settings) -> Settings:
     """The settings with the planner's table."""
-    types = {option.name: _type(option) for option in OPTIONS}
+    types = {option.name: option.values for option in OPTIONS}
     for key in document.tables.get(PLANNER, {}):
         if fixed := refusal(key):
             raise InputError(f"{document.where(PLANNER, key)}: {fixed}")
@@ -240,11 +241,13 @@ def _with_planner(document: Document, settings: Settings) -> Settings:
     table = dict(document.tables.get(PLANNER, {}))
     preset = checked(table.pop("preset", DEFAULT_PRESET), Literal[tuple(PRESETS)], document.where(PLANNER, "preset"))
     given = {name: checked(value, types[name], document.where(PLANNER, name)) for name, value in table.items()}
-    return apply(document, PLANNER, given, lambda options: settings.with_options(preset, **options))
-
-
-def _type(option: Option) -> Any:
-    return Literal[option.choices] if option.choices else option.type
+    inside = {option.name: option.inside for option in OPTIONS}
+    return apply(
+        document,
+        PLANNER,
+        given,
+        lambda options: settings.with_options(preset, **{name: inside[name](value) for name, value in options.items()}),
+    )
 
 
 def example_config() -> str:
