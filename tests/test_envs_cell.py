@@ -45,7 +45,7 @@ def test_a_file_says_workcell_and_planner(file):
     assert policy.config == expected.config
     assert policy.tries
     assert expected.tries
-    assert searcher._trials is named_trials("physics")
+    assert searcher._trials == named_trials("physics")
     assert (policy.predict, policy.objective, policy.plan) == (expected.predict, expected.objective, expected.plan)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -21,10 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.mismatch import TrueCell
 from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import in_order
 
 
-class BodyFields(flax.struct.PyTreeNode):
+class BodyFields(PyTreeNode):
     """Fields of the model that depend on the bodies' shapes and on the cell, with a leading axis for the worlds.
 
     Names, units and further axes (bodies, geoms, degrees of freedom) are those of MJX's model.
@@ -44,7 +44,7 @@ class BodyFields(flax.struct.PyTreeNode):
     body_gravcomp: jax.Array
 
 
-class Cells(flax.struct.PyTreeNode):
+class Cells(PyTreeNode):
     """How the worlds differ from what the planner assumes: what of an `TrueCell` this simulator's model holds.
 
     Attributes:

@@ -10,7 +10,6 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +17,7 @@ from scipy.spatial import HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import PRIMITIVES
 from mechsearch_jax.shapes.compound import (
     COMPOUND,
@@ -41,7 +41,7 @@ FACES = 2 * MOST_VERTICES - 4
 _NOTHING = 1e-3
 
 
-class Solids(flax.struct.PyTreeNode):
+class Solids(PyTreeNode):
     """The solids of bodies, in the bodies' frames; leading axes (..., 9, 16).
 
     Attributes:
@@ -62,7 +62,7 @@ class Solids(flax.struct.PyTreeNode):
     valid: jax.Array
 
 
-class Matter(flax.struct.PyTreeNode):
+class Matter(PyTreeNode):
     """What bodies are made of; leading axes (..., 9).
 
     Attributes:
@@ -82,7 +82,7 @@ class Matter(flax.struct.PyTreeNode):
     colour: jax.Array
 
 
-class Compounds(flax.struct.PyTreeNode):
+class Compounds(PyTreeNode):
     """What a `World` of compounds knows beside a plain one.
 
     Attributes:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.identity import Uncompared
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.shapes import Shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, half_extents
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
@@ -38,7 +38,7 @@ def fallen_over(rotation: Float[np.ndarray, "3 3"], ends_alike: bool = True) -> 
     return bool(upright < math.cos(MAX_TILT))
 
 
-class World(flax.struct.PyTreeNode):
+class World(PyTreeNode):
     """All bodies on the shelf. Every field has the leading axes (..., 9): eight slots for objects, then the target.
 
     Attributes:
@@ -76,8 +76,8 @@ class TargetCompoundWorld(CompoundWorld):
       room: half-extents of a box that has room for it, in steps of `ROOM` [m]; static.
     """
 
-    made_of: Uncompared[Compound] = flax.struct.field(pytree_node=False)
-    room: tuple[float, float, float] = flax.struct.field(pytree_node=False)
+    made_of: Uncompared[Compound] = static()
+    room: tuple[float, float, float] = static()
 
     @property
     def target(self) -> Compound:

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import math
 
-import flax.struct
 import jax
 import numpy as np
 
@@ -16,6 +15,7 @@ from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import in_degrees, option
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Longer pushes would leave the shelf [m].
@@ -116,7 +116,7 @@ class ActionConfig:
             raise InputError(f"push_postures {self.push_postures} must be pairs of a yaw and an index in push_wrists")
 
 
-class ActionTables(flax.struct.PyTreeNode):
+class ActionTables(PyTreeNode):
     """Constants of the actions, for W wrist angles; clouds are in the gripper's frame, open (`OPEN`), then closed.
 
     Attributes:

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.calibration.faces import FACES, Face
 from mechsearch_jax.calibration.patches import flat_patches
@@ -97,7 +96,7 @@ class ShelfFit:
     def corrected(self) -> Camera:
         """The camera where the image says that it is."""
         T = np.eye(4)
-        turn = Rotation.from_rotvec(self.turn).as_matrix()
+        turn = _matrix(self.turn)
         T[:3, :3] = turn @ np.array(self.camera.rotation)
         T[:3, 3] = turn @ (np.array(self.camera.position) - self.pivot) + self.pivot + self.shift
         return with_pose(self.camera, T)
@@ -165,7 +164,7 @@ class _Fit:
             camera,
             self.pivot,
             self.shift,
-            Rotation.from_matrix(self.turn).as_rotvec(),
+            _vector(self.turn),
             scale @ covariance @ scale,
             free,
             tuple(self._seen(face) for face in FACES),
@@ -193,7 +192,7 @@ class _Fit:
         # One face alone leaves the rotation about its normal free, but for noise in the normals.
         kept = values > 0.02
         step = vectors[:, kept] @ ((vectors[:, kept].T @ pull) / values[kept])
-        turn = Rotation.from_rotvec(step).as_matrix()
+        turn = _matrix(step)
         self.turn = turn @ self.turn
         # About the camera, which is turned about itself more often than the shelf is about its middle.
         self.shift = turn @ (self.pivot + self.shift - self.place) + self.place - self.pivot
@@ -269,15 +268,15 @@ class _Fit:
         kept = np.maximum(residual, LEAST_RESIDUAL) < LEAST_PRECISION * np.sqrt(np.maximum(values, 0.0))
         inside, values = vectors[:, kept], values[kept]
         step = inside @ (inside.T @ pull / values)
-        self.turn = Rotation.from_rotvec(step[3:] / LEVER).as_matrix() @ self.turn
+        self.turn = _matrix(step[3:] / LEVER) @ self.turn
         self.shift = self.shift + step[:3]
         return residual**2 * (inside / values) @ inside.T, vectors[:, ~kept]
 
     def _give_back(self, free: np.ndarray) -> None:
         """Take the part of the motion back that lies in directions of (shift, `LEVER` * turn), as columns."""
-        motion = np.concatenate([self.shift, LEVER * Rotation.from_matrix(self.turn).as_rotvec()])
+        motion = np.concatenate([self.shift, LEVER * _vector(self.turn)])
         motion -= free @ (free.T @ motion)
-        self.shift, self.turn = motion[:3], Rotation.from_rotvec(motion[3:] / LEVER).as_matrix()
+        self.shift, self.turn = motion[:3], _matrix(motion[3:] / LEVER)
 
     def _seen(self, face: Face) -> FaceFit:
         place = self._outermost(face)
@@ -287,3 +286,17 @@ class _Fit:
         on = self._candidates(face, points, normals, 0.01)
         on &= np.abs(face.height(self.shelf, points) - place[0]) < REACHES[-1]
         return FaceFit(face, int(on.sum()), int(self.pixels[on].sum()), place[0])
+
+
+def _matrix(turn: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation by a rotation vector [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(turn).as_matrix()
+
+
+def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+    """The rotation vector [rad] of a rotation."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 
-import flax.struct
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -13,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from mechsearch_jax.existence.config import ExistenceConfig
 from mechsearch_jax.geometry.transforms import transform, upright_pose
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
@@ -25,7 +25,7 @@ BLOCK, ROWS = 32, 1024
 SIDES = (32, 48, 64, 96, 128)
 
 
-class ExistenceTables(flax.struct.PyTreeNode):
+class ExistenceTables(PyTreeNode):
     """Constants of f in a `Problem`, for S places at each of X candidate poses.
 
     Attributes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +13,12 @@ from mechsearch_jax.geometry.bodies import per_part, world_parts
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 
 
-class ObjectViews(flax.struct.PyTreeNode):
+class ObjectViews(PyTreeNode):
     """Image and collisions of each object; after a motion only those of the moved objects are recomputed.
 
     Attributes:

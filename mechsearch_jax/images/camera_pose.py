@@ -15,17 +15,16 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry.transforms import compose, exponential, inverse, make, matmul, rotate, transform
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.robot.gripper import FINGER_BASE, Primitive, finger_parts, hand_parts, link_parts
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 
 HAND_FRAME = 7
@@ -53,11 +52,11 @@ def _solids() -> _Solids:
     lifted = np.eye(4)
     lifted[2, 3] = FINGER_BASE
     parts: list[tuple[int, np.ndarray, Primitive, float]] = [
-        (i, np.eye(4), primitive, 0.0) for i, link in enumerate(LINKS) for primitive in link
+        (i, np.eye(4), primitive, 0.0) for i, link in enumerate(link_parts()) for primitive in link
     ]
-    parts += [(HAND_FRAME, np.eye(4), primitive, 0.0) for primitive in HAND]
-    parts += [(HAND_FRAME, lifted, primitive, 1.0) for primitive in FINGER]
-    parts += [(HAND_FRAME, lifted @ turned, primitive, -1.0) for primitive in FINGER]
+    parts += [(HAND_FRAME, np.eye(4), primitive, 0.0) for primitive in hand_parts()]
+    parts += [(HAND_FRAME, lifted, primitive, 1.0) for primitive in finger_parts()]
+    parts += [(HAND_FRAME, lifted @ turned, primitive, -1.0) for primitive in finger_parts()]
     box = [primitive.kind == "box" for _, _, primitive, _ in parts]
     return _Solids(
         frame=np.array([frame for frame, _, _, _ in parts]),
@@ -132,7 +131,7 @@ class PoseConfig:
             raise InputError(f"PoseConfig: minimum_points ({self.minimum_points}) must be at least 6")
 
 
-class PoseEstimate(flax.struct.PyTreeNode):
+class PoseEstimate(PyTreeNode):
     """A corrected camera pose.
 
     Attributes:
@@ -154,6 +153,8 @@ class PoseEstimate(flax.struct.PyTreeNode):
 
 def with_pose(camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> Camera:
     """The camera at another pose."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_matrix(np.asarray(T_world_camera[:3, :3], float)).as_matrix()
     return dataclasses.replace(
         camera,

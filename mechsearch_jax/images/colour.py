@@ -8,16 +8,14 @@ import functools
 import math
 from collections.abc import Callable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse.csgraph
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import KDTree
 
 from mechsearch_jax.images.labels import OTHER
 from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).
 ColourDifference = Callable[[Array, Array], Array]
@@ -177,7 +175,7 @@ def rgb_of_hue(hue: float, saturation: float) -> tuple[float, float, float]:
     return colorsys.hsv_to_rgb(hue / 360.0, saturation, 1.0)
 
 
-class Detection(flax.struct.PyTreeNode):
+class Detection(PyTreeNode):
     """Which segment is the target.
 
     Attributes:
@@ -236,8 +234,10 @@ class ClusterConfig:
 
 
 def _components(size: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    graph = scipy.sparse.coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    from scipy.sparse import coo_array, csgraph
+
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size))
+    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def cluster_by_colour(
@@ -262,6 +262,8 @@ def cluster_by_colour(
     Returns:
       segment of every pixel, numbered by decreasing size; `labels.OTHER` for none.
     """
+    from scipy.spatial import KDTree
+
     config = config or ClusterConfig()
     tint = np.array(chromaticity(jnp.asarray(colour, jnp.float32)))
     index = np.arange(foreground.size).reshape(foreground.shape)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
@@ -25,6 +24,7 @@ from mechsearch_jax.images.target_evidence import (
     within_shelf,
 )
 from mechsearch_jax.images.target_pixels import SURFACE, coloured_pixels
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -45,7 +45,7 @@ SHARE = 0.85
 OWN = 0.012
 
 
-class ColouredDepth(flax.struct.PyTreeNode):
+class ColouredDepth(PyTreeNode):
     """A depth image with colours.
 
     Attributes:
@@ -59,7 +59,7 @@ class ColouredDepth(flax.struct.PyTreeNode):
     colour: jax.Array
 
 
-class Detection(flax.struct.PyTreeNode):
+class Detection(PyTreeNode):
     """The target in an image.
 
     Attributes:
@@ -131,7 +131,7 @@ def detect(
     return jax.lax.while_loop(goes_on, look, (jnp.int32(0), coloured, no_detection(image.depth)))[2]
 
 
-class _Scene(flax.struct.PyTreeNode):
+class _Scene(PyTreeNode):
     """What is the same at every place: the pixels, which are near the shelf's space, the camera's position, ..."""
 
     sample: Sample

@@ -6,12 +6,12 @@ import dataclasses
 import functools
 import math
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 UP = (0.0, 0.0, 1.0)
 
@@ -43,7 +43,7 @@ class PlaneConfig:
             )
 
 
-class Plane(flax.struct.PyTreeNode):
+class Plane(PyTreeNode):
     """All x with `normal @ x = offset`.
 
     Attributes:

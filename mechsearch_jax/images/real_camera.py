@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +25,7 @@ from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
 from mechsearch_jax.images.target_pixels import evened
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -76,7 +76,7 @@ class RealCameraConfig:
                 raise InputError(f"RealCameraConfig: {field} ({getattr(self, field)}) must not be negative, in metres")
 
 
-class PreparedImage(flax.struct.PyTreeNode):
+class PreparedImage(PyTreeNode):
     """A prepared depth and colour image.
 
     Attributes:
@@ -96,7 +96,7 @@ class PreparedImage(flax.struct.PyTreeNode):
     detection: Detection
     floor: Plane
     pose: PoseEstimate | None
-    camera: Camera = flax.struct.field(pytree_node=False)
+    camera: Camera = static()
 
     @property
     def target_id(self) -> jax.Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import exponential, matmul, yaw_rotation
 from mechsearch_jax.images.target_pose import LONGEST_STEP, descend, distance, start_yaws
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes.solid import Solid
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -33,14 +33,14 @@ STARTS = ((0.0, 0.65), (-0.8, 0.5), (0.8, 0.5))
 LONGEST_FREE_STEP = (LONGEST_STEP[0],) * 3 + (LONGEST_STEP[2],) * 3
 
 
-class Placement(flax.struct.PyTreeNode):
+class Placement(PyTreeNode):
     """A pose of the target in the world: `R_world_target`, shape (..., 3, 3), and its centre [m], shape (..., 3)."""
 
     rotation: jax.Array
     centre: jax.Array
 
 
-class Sample(flax.struct.PyTreeNode):
+class Sample(PyTreeNode):
     """N pixels of an image.
 
     Attributes:
@@ -58,7 +58,7 @@ class Sample(flax.struct.PyTreeNode):
     tolerance: jax.Array
 
 
-class Evidence(flax.struct.PyTreeNode):
+class Evidence(PyTreeNode):
     """The numbers of pixels that speak for and against a placement."""
 
     support: jax.Array

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.images.target_pixels import coloured_pixels
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.edges import on_own_surfaces
 from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
@@ -36,6 +35,9 @@ from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
+
+if TYPE_CHECKING:
+    from mechsearch_jax.networks.weights import Weights
 
 # Gives the target's pixels, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]

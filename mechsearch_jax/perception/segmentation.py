@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
@@ -16,10 +15,13 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.images.cloud import above_board, cloud_of, middle, resample, surfaces
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
-from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
+
+if TYPE_CHECKING:
+    from mechsearch_jax.networks.segmentation import SegmentationNetwork
+    from mechsearch_jax.networks.weights import Weights
 
 # Parts of a cloud in which the nearest point is searched for, if they are of equal size.
 _PARTS = 64
@@ -165,7 +167,7 @@ def leave_out_smallest(labels: Int[Array, "h w"]) -> Int[Array, "h w"]:
     return jnp.where(labels == smallest, OTHER, rest).astype(jnp.int8)
 
 
-class NetworkSegmenter(flax.struct.PyTreeNode):
+class NetworkSegmenter(PyTreeNode):
     """The `Segmenter` that segments a cloud of the image's points with the segmentation network.
 
     Attributes:
@@ -175,16 +177,20 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
     """
 
     parameters: Any
-    network: SegmentationNetwork = flax.struct.field(pytree_node=False)
-    view: TrainedView | None = flax.struct.field(pytree_node=False, default=None)
+    network: SegmentationNetwork = static()
+    view: TrainedView | None = static(default=None)
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
         """The segmenter with the given weights; the package's if None."""
+        from mechsearch_jax.networks.weights import shipped_weights
+
         weights = weights or shipped_weights("segmentation")
-        return cls(weights.parameters, cast(SegmentationNetwork, weights.network), weights.view)
+        return cls(weights.parameters, cast("SegmentationNetwork", weights.network), weights.view)
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
+        from mechsearch_jax.networks.segmentation import apply_network
+
         objects = above_board(shelf, points) & ~of_target
         surface = surfaces(points, objects).reshape(-1)
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface)

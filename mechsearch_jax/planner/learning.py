@@ -14,7 +14,6 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief
@@ -209,6 +208,8 @@ def _misfit(predicted: Float[np.ndarray, "k 3"], seen: Float[np.ndarray, "m 3"],
 
     What comes into sight costs nothing. NaN if a place is NaN.
     """
+    from scipy.optimize import linear_sum_assignment
+
     if np.isnan(predicted).any():
         return math.nan
     there, visible = len(predicted), len(seen)

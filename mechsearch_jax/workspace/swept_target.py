@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from mechsearch_jax.workspace.target import Target
+
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
 
 # Multiple of the points on a swept target of several pieces that are drawn, since most are in other pieces' ways.
 SPARE = 4
@@ -19,6 +21,9 @@ FACES = 16
 
 def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
     """Surface of the volume that the target sweeps along a direction, in its own frame, shape (count, 3) [m]."""
+    import trimesh
+    from scipy.spatial import ConvexHull
+
     way = distance * np.asarray(direction)
     if target.compound is None:
         (mesh,) = target.solid.hulls(erosion)
@@ -43,6 +48,8 @@ def _corners(target: Target, erosion: float) -> tuple[Float[np.ndarray, "n 3"], 
 
 def _drawn(hull: ConvexHull, count: int, seed: int) -> Float[np.ndarray, "{count} 3"]:
     """Points on the surface of a convex hull [m]."""
+    import trimesh
+
     # Much faster than `trimesh.convex.convex_hull`, whose faces all turn the same way, which does not count here.
     surface = trimesh.Trimesh(hull.points, hull.simplices, process=False)
     return np.asarray(trimesh.sample.sample_surface(surface, count, seed=seed)[0])

@@ -8,13 +8,13 @@ import zlib
 from collections.abc import Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, half_extents, solids
 from mechsearch_jax.shapes.parts import part_rows
@@ -25,7 +25,7 @@ from mechsearch_jax.shapes.solid import Union
 PLANES = 768
 
 
-class TargetData(flax.struct.PyTreeNode):
+class TargetData(PyTreeNode):
     """The geometry of a target of pieces, in the frame of its centre of mass.
 
     Attributes:
@@ -53,9 +53,9 @@ class TargetData(flax.struct.PyTreeNode):
     radius: Any
     parts: tuple[Any, ...]
     number: Any
-    turn: float = flax.struct.field(pytree_node=False)
-    round: bool = flax.struct.field(pytree_node=False)
-    primitives: tuple[Piece, ...] = flax.struct.field(pytree_node=False)
+    turn: float = static()
+    round: bool = static()
+    primitives: tuple[Piece, ...] = static()
 
     def is_of(self, compound: Compound | None) -> bool:
         """Whether these are the arrays of a compound; False inside of a program."""

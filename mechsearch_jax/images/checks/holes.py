@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy import ndimage
 
 from mechsearch_jax.images.checks.look import Look, Part
 from mechsearch_jax.images.cloud import density
@@ -23,11 +22,15 @@ RIM = 0.01
 
 def _numbered(pixels: Bool[np.ndarray, "h w"], around: np.ndarray | None = None) -> Int[np.ndarray, "h w"]:
     """A number for each pixel, the same for connected ones; 0 for the others."""
+    from scipy import ndimage
+
     return np.asarray(ndimage.label(pixels, around)[0])  # pyright: ignore[reportIndexIssue]
 
 
 def hole_faults(look: Look) -> tuple[str, ...]:
     """A warning if connected pixels without a measurement could hide a small object in the shelf."""
+    from scipy import ndimage
+
     part = look.thinned
     into = _into_shelf(part)
     side = max(3, round(SMALL * density(part.view.camera, look.shelf)))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull, KDTree
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -45,6 +44,7 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.n
     be nearer.
     """
     import trimesh
+    from scipy.spatial import KDTree
 
     samples, face = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[:2]
     # Small triangles may have no sample.
@@ -91,6 +91,8 @@ def beyond(hulls: Sequence[Float[np.ndarray, "_ 3"]], points: Float[np.ndarray, 
 
     That is the distance to the plane of a face: before an edge or a corner it is less than the true one.
     """
+    from scipy.spatial import ConvexHull
+
     planes = [ConvexHull(vertices).equations for vertices in hulls]
     return np.clip(np.min([np.max(points @ p[:, :3].T + p[:, 3], axis=1) for p in planes], axis=0), 0.0, None)
 

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from mechsearch_jax.shapes.compound import hull_volume
 from mechsearch_jax.shapes.surfaces.deviation import turns_around
@@ -82,6 +79,8 @@ def open_edges(mesh: Trimesh) -> Int[np.ndarray, "n 2"]:
 
 def _welded(mesh: Trimesh) -> Trimesh:
     """The mesh without seams: other vertices than those of open edges stay, however near to each other."""
+    from scipy.spatial import KDTree
+
     border = np.unique(open_edges(mesh))
     if len(border):
         pairs = border[KDTree(mesh.vertices[border]).query_pairs(SEAM, output_type="ndarray")]
@@ -97,6 +96,9 @@ def _welded(mesh: Trimesh) -> Trimesh:
 
 
 def _components(pairs: Int[np.ndarray, "n 2"], count: int) -> Int[np.ndarray, " count"]:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(graph, directed=False)[1]
 
