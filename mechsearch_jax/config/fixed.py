@@ -92,7 +92,7 @@ def refusal(name: str) -> str | None:
 def renamed(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a row or an episode of an earlier version, by the names that this version has."""
     prefixed = {f"mismatch.{former}": f"mismatch.{new}" for former, new in RENAMED.items()}
-    return {(RENAMED | prefixed).get(name, name): value for name, value in options.items()}
+    return {{**RENAMED, **prefixed}.get(name, name): value for name, value in options.items()}
 
 
 def without_fixed(options: Mapping[str, Any]) -> dict[str, Any]:
