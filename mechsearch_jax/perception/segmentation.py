@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -15,7 +14,6 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.images.cloud import above_board, cloud_of, middle, resample, surfaces
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -23,6 +21,10 @@ if TYPE_CHECKING:
     from mechsearch_jax.networks.segmentation import SegmentationNetwork
     from mechsearch_jax.networks.weights import Weights
 
+# How labels of points are cleaned up: this many nearest points within `REACH` [m] vote on a point's label, itself
+# included, in so many rounds; points of segments of fewer than `LEAST_SEGMENT` points take the label of the nearest
+# other segment. Points without a label within `REACH` become OTHER.
+NEIGHBOURS, ROUNDS, LEAST_SEGMENT, REACH = 9, 1, 8, 0.02
 # Parts of a cloud in which the nearest point is searched for, if they are of equal size.
 _PARTS = 64
 
@@ -47,27 +49,6 @@ class Segmenter(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
-class CleanUpConfig:
-    """How labels of points are cleaned up.
-
-    Attributes:
-      neighbours: number of nearest points within `reach` that vote on a point's label, itself included.
-      rounds: of voting.
-      minimum: points of smaller segments take the label of the nearest other segment.
-      reach: points farther apart do not vote on or take each other's label [m]; points without a label become OTHER.
-    """
-
-    neighbours: int = 9
-    rounds: int = 1
-    minimum: int = 8
-    reach: float = 0.02
-
-    def __post_init__(self):
-        if self.neighbours < 1 or self.rounds < 0 or self.minimum < 0 or self.reach <= 0:
-            raise InputError("CleanUpConfig: neighbours must be at least 1, rounds and minimum 0, reach positive")
-
-
 def _squares(a: Array, b: Array) -> Array:
     """Squared distances between two clouds [m2]."""
     return sum(((a[:, None, i] - b[None, :, i]) ** 2 for i in range(3)), jnp.zeros(()))
@@ -79,23 +60,19 @@ def labels_of(logits: Float[Array, "p classes"]) -> Int[Array, " p"]:
     return jnp.where(best == INSTANCES, OTHER, best).astype(jnp.int8)
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def clean_up(
-    points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"], config: CleanUpConfig | None = None
-) -> Int[Array, " p"]:
+@jax.jit
+def clean_up(points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"]) -> Int[Array, " p"]:
     """Labels after neighbours voted and small segments were merged, int8; OTHER where `valid` is false.
 
     Args:
       points: [m].
       labels: instances' numbers, or OTHER.
       valid: which points exist.
-      config: static.
     """
-    config = config or CleanUpConfig()
     instances = jnp.arange(INSTANCES)
     square = jnp.where(valid[None, :], _squares(points, points), jnp.inf)
-    nearness, nearest = jax.lax.top_k(-square, config.neighbours)
-    votes_count = (-nearness < config.reach**2)[..., None]
+    nearness, nearest = jax.lax.top_k(-square, NEIGHBOURS)
+    votes_count = (-nearness < REACH**2)[..., None]
     member = (labels[:, None] == instances[None, :]) & valid[:, None]
 
     def vote(_, member):
@@ -105,13 +82,13 @@ def clean_up(
         elected = (best[:, None] == instances[None, :]) & (jnp.max(votes, axis=1) > 0)[:, None]
         return elected & member.any(axis=1)[:, None] & valid[:, None]
 
-    member = jax.lax.fori_loop(0, config.rounds, vote, member)
-    kept = jnp.sum(member, axis=0) >= config.minimum
+    member = jax.lax.fori_loop(0, ROUNDS, vote, member)
+    kept = jnp.sum(member, axis=0) >= LEAST_SEGMENT
     lost = member.any(axis=1) & ~(member & kept[None]).any(axis=1)
     stays = (member & kept[None]).any(axis=1)
     distance = jnp.where(stays[None, :], square, jnp.inf)
     source = jnp.argmin(distance, axis=1)
-    near = jnp.min(distance, axis=1) < config.reach**2
+    near = jnp.min(distance, axis=1) < REACH**2
     label = jnp.where(stays, jnp.argmax(member & kept[None], axis=1), OTHER)
     return jnp.where(lost & near, label[source], label).astype(jnp.int8)
 
