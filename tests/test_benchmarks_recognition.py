@@ -221,7 +221,7 @@ def test_slow_methods_are_measured_on_scenes_spread_over_all(slow_scenes, expect
 
 def test_two_scenarios_of_one_name_are_refused():
     scenario = load_scenario(example_scenarios()["first-light"])
-    with pytest.raises(InputError, match="two scenarios have the name"):
+    with pytest.raises(InputError, match="two scenes are called"):
         images.scenes_of([scenario, scenario])
 
 

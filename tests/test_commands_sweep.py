@@ -335,7 +335,7 @@ def test_outlines_of_sets_are_those_of_their_files(folder):
     assert (outline.name, len(outline.objects), outline.target.shape) == ("d1-003", 2, "cylinder")
     assert outline.content_hash == recorded()["d1"][3]
     assert [outline.name for outline in outlines_of(["one.json", "d3-4"])][:2] == ["one", "d3-4-000"]
-    with pytest.raises(InputError, match="two scenarios have the name 'd1-003'"):
+    with pytest.raises(InputError, match="two scenes are called d1-003"):
         planned_jobs([outline, outline], [Method()], (0,))
     with pytest.raises(InputError, match="no scenario is given"):
         outlines_of([])

@@ -11,7 +11,7 @@ from typing import Any
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import Block, recorded
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import check_once
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 
@@ -83,11 +83,6 @@ def planned_jobs(scenes: Iterable[SceneOutline], methods: Sequence[Method], seed
     Raises:
       InputError: two scenes have the same name.
     """
-    names: set[str] = set()
-    jobs = []
-    for scene in scenes:
-        if scene.name in names:
-            raise InputError(f"two scenarios have the name {scene.name!r}; rename one of them")
-        names.add(scene.name)
-        jobs += [PlannedJob(scene, method, seed) for method, seed in itertools.product(methods, seeds)]
-    return jobs
+    scenes = list(scenes)
+    check_once("two scenes", (scene.name for scene in scenes))
+    return [PlannedJob(scene, method, seed) for scene, method, seed in itertools.product(scenes, methods, seeds)]

@@ -13,7 +13,7 @@ import tyro
 
 from mechsearch_jax.benchmarks.lab import PROGRAM
 from mechsearch_jax.commands.options import SomeScenarios, at_least_one, find_scenarios
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_once
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.known_target.search import Node
@@ -35,12 +35,9 @@ def _scenes(names: Sequence[str]) -> list[Scenario]:
     """
     from mechsearch_jax.workspace.scenario import load_scenario
 
-    scenes: dict[str, Scenario] = {}
-    for scene in map(load_scenario, find_scenarios(names)):
-        if scene.name in scenes:
-            raise InputError(f"lab ceiling: two scenes are called {scene.name}; rename one")
-        scenes[scene.name] = scene
-    return list(scenes.values())
+    scenes = list(map(load_scenario, find_scenarios(names)))
+    check_once("lab ceiling: two scenes", (scene.name for scene in scenes))
+    return scenes
 
 
 def _nearest(best: Node) -> str:

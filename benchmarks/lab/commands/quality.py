@@ -21,7 +21,7 @@ from mechsearch_jax.commands.options import (
     forget_kept_compilations,
     settings_of,
 )
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_once
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -207,10 +207,7 @@ def _places(command: str, files: Sequence[Path], scenarios: Sequence[str]) -> di
 
     if files and scenarios:
         raise InputError(f"{command}: --config is for generated scenes; leave the scenario files out")
-    names = [file.stem for file in files]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"{command}: two configuration files are called {twice}; rename one")
+    check_once(f"{command}: two configuration files", (file.stem for file in files))
     return {file.stem: settings_of(file).workcell for file in files} or {"held-out": Workcell()}
 
 
@@ -330,9 +327,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"lab scenes: two sources are called {twice}; rename one")
+    check_once("lab scenes: two sources", names)
     sources = {name: _loaded([given]) for name, given in zip(names, scenarios, strict=True)}
     if not sources:
         find_scenarios([])
