@@ -117,7 +117,7 @@ WRONG = {
     "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
     "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
-    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "named 'one-box'"),
+    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "two scenes are called one-box"),
     "results in a file": (
         ["evaluate", "good.json", "--out", "out/rows.parquet"],
         "rows.parquet: results are kept in a folder, not in a file",
@@ -212,7 +212,7 @@ WRONG = {
     "nothing to segment": (["lab", "segmentation", "--scenes", "0"], "there are no scenes"),
     "no picture of segments": (["lab", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
     "no picture": (["lab", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
-    "the same scene twice": (["lab", "recognition", "good.json", "good.json"], '"one-box"'),
+    "the same scene twice": (["lab", "recognition", "good.json", "good.json"], "two scenes are called one-box"),
     "picture of nothing": (
         ["lab", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
         "--worst-of network-refined is not among the methods",

@@ -9,8 +9,7 @@ import pytest
 from scipy import ndimage
 from test_perception_plausibility import CAMERA, IN_SIGHT, SCENE, SHELF, sensed, unseen
 
-from mechsearch_jax.images.checks.holes import hole_faults, unmeasured_target_faults
-from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.images.checks import Look, hole_faults, unmeasured_target_faults
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.examples import example_images
 

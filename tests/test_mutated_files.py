@@ -18,7 +18,7 @@ from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.fit import fit_shelf
 from mechsearch_jax.calibration.report import report
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.examples import Images, example_images, load_images, save_images
 from mechsearch_jax.images.image_files import (
     load_camera,

@@ -11,7 +11,7 @@ from published import published_scenarios
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
-from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.colour import RED, TargetColour
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation

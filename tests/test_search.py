@@ -28,7 +28,7 @@ from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose
-from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.images.measured import share_step
 from mechsearch_jax.observation import Observation

@@ -248,7 +248,10 @@ def read_reference(path: PathLike) -> Reference:
     Raises:
       InputError: the file cannot be read, or is something else.
     """
-    value = read_json(path)
+    try:
+        value = read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; write a reference with --write") from error
     try:
         outcomes = [Outcome(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
         return Reference(value["code"], outcomes)

@@ -22,7 +22,7 @@ from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.robot.arm_config import ArmModel
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.session.searcher import Searcher
-from mechsearch_jax.session.view import View
+from mechsearch_jax.session.step import View
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 

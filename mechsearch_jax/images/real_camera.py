@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.camera_pose import STAGES, PoseEstimate, estimate_pose, panda_distance
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.colour import Detection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, find_plane

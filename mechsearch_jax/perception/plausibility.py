@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mechsearch_jax.calibration.faces import FACES, Face
-from mechsearch_jax.images.checks.look import Look
+from mechsearch_jax.calibration.fit import FACES, Face
+from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.planes import TOLERANCE, find_plane
 from mechsearch_jax.images.target_pixels import fitted_pose

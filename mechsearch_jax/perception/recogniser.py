@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.detection import ColouredDepth, detect, no_detection

@@ -11,9 +11,7 @@ from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT
-from mechsearch_jax.images.checks.holes import hole_faults, unmeasured_target_faults
-from mechsearch_jax.images.checks.look import Look
-from mechsearch_jax.images.checks.usable import check_images
+from mechsearch_jax.images.checks import Look, check_images, hole_faults, unmeasured_target_faults
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import lost_faults

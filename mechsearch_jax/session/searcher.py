@@ -51,8 +51,7 @@ from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
 from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
-from mechsearch_jax.session.step import Motion, Present, SearchStep, display_image, motion_of
-from mechsearch_jax.session.view import View
+from mechsearch_jax.session.step import Motion, Present, SearchStep, View, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.sight import check_camera
 

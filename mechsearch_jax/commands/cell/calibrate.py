@@ -42,7 +42,7 @@ def calibrate(
     from mechsearch_jax.calibration.check import check_holds, check_in_sight
     from mechsearch_jax.calibration.fit import fit_shelf
     from mechsearch_jax.calibration.report import report
-    from mechsearch_jax.images.checks.usable import check_images
+    from mechsearch_jax.images.checks import check_images
     from mechsearch_jax.images.image_files import load_camera, load_depth
     from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.workspace.sight import check_camera
