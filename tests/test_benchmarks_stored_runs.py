@@ -10,7 +10,7 @@ from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.lab.site import store_run
 from mechsearch_jax.benchmarks.lab.site.store_run import run_of, scene_set_of
-from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import episode_key

@@ -11,7 +11,7 @@ import pytest
 
 import mechsearch_jax
 from mechsearch_jax.benchmarks.lab.site import results_page
-from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes

@@ -89,7 +89,7 @@ def bench_ceiling(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.ceiling import solvability
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import ceiling_table
+    from mechsearch_jax.benchmarks.lab.tables import ceiling_table
     from mechsearch_jax.envs.known_target.search import KnownSearchConfig
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable

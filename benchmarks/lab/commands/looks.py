@@ -47,7 +47,7 @@ def bench_looks(
 
     from mechsearch_jax.benchmarks.lab.looks import looks
     from mechsearch_jax.benchmarks.lab.looks.pictures import taken
-    from mechsearch_jax.benchmarks.lab.tables.looks_tables import looks_tables
+    from mechsearch_jax.benchmarks.lab.tables import looks_tables
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.runtime.files import save_json
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -93,7 +93,7 @@ def bench_bodies(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.looks import bodies
-    from mechsearch_jax.benchmarks.lab.tables.bodies_tables import bodies_tables
+    from mechsearch_jax.benchmarks.lab.tables import bodies_tables
     from mechsearch_jax.runtime.files import save_json
     from mechsearch_jax.workspace.scenario import load_scenario
 

@@ -65,7 +65,7 @@ def bench_agreement(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts.agreement import agreement, draw_actions, generated_scenes
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import agreement_table
+    from mechsearch_jax.benchmarks.lab.tables import agreement_table
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import save_json
@@ -143,7 +143,7 @@ def bench_recognition(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.benchmarks.lab.tables import recognition_tables, recognition_times_table
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("lab recognition", worst=drawn.worst)
@@ -236,7 +236,7 @@ def bench_segmentation(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, segmentation
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import segmentation_tables
+    from mechsearch_jax.benchmarks.lab.tables import segmentation_tables
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.viz.drawing import save_figure
 
@@ -288,7 +288,7 @@ def bench_push(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import push
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import push_scores_tables
+    from mechsearch_jax.benchmarks.lab.tables import push_scores_tables
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable, save_json
     from mechsearch_jax.train.run import counting
@@ -323,7 +323,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import scenes
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import scenes_table
+    from mechsearch_jax.benchmarks.lab.tables import scenes_table
     from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]
@@ -354,7 +354,7 @@ def bench_detection(scenarios: Scenarios, /, *, places: int = 3, seed: int = 0, 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.detection.detection import conditions, detection_figures
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import detection_table
+    from mechsearch_jax.benchmarks.lab.tables import detection_table
     from mechsearch_jax.runtime.files import save_json
 
     check_files(out)

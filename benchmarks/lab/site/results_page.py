@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
-from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
