@@ -16,8 +16,7 @@ from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
 from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, MeasuredSeconds, StoredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
-from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
-from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, make_jobs, planned_jobs, present_code
 from mechsearch_jax.benchmarks.store.runs import StoredRun, stored_runs
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli

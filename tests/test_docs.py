@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45
+from mechsearch_jax.benchmarks.statistics.preset_names import FROM_THE_FRONT, WITHIN_45
 from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import load_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded

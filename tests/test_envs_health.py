@@ -9,8 +9,8 @@ import pytest
 
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
-from mechsearch_jax.envs.health import checks as health
-from mechsearch_jax.envs.health.finding import State
+from mechsearch_jax.envs.health import cell_health as health
+from mechsearch_jax.envs.health.cell_health import State
 from mechsearch_jax.networks import weights
 from mechsearch_jax.problem import cache
 from mechsearch_jax.problem.problem import NOWHERE

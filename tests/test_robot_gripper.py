@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mechsearch_jax.envs.health.checks import robot_meshes
+from mechsearch_jax.envs.health.cell_health import robot_meshes
 from mechsearch_jax.geometry.swept_cloud import mesh_of
 from mechsearch_jax.robot import gripper as module
 from mechsearch_jax.robot import kinematics

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import THREE_AHEAD, settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.episode.method import Method

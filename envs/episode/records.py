@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.config.fixed import renamed
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, read_json, replacing
 
@@ -178,7 +179,8 @@ def episode_of(value: Any) -> Episode:
     Raises:
       TypeError, KeyError: they are of something else.
     """
-    return Episode(**{**value, "steps": tuple(_step(step) for step in value["steps"])})
+    steps = tuple(_step(step) for step in value["steps"])
+    return Episode(**{**value, "steps": steps, "config": renamed(value["config"])})
 
 
 def _step(value: Any) -> Step:

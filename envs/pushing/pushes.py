@@ -71,16 +71,6 @@ class PushesConfig:
     renewed: float = 0.2
     renewed_toppled: float = 0.7
 
-    def __post_init__(self):
-        for name in ("sideways", "planned", "renewed", "renewed_toppled"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"PushesConfig: {name} {getattr(self, name)} must be between 0 and 1")
-        for name in ("lengths", "gap"):
-            if not 0 < getattr(self, name)[0] <= getattr(self, name)[1]:
-                raise InputError(f"PushesConfig: {name} {getattr(self, name)} must be a range of positive numbers")
-        if self.tries < 1 or not self.highest > LOW_CONTACT:
-            raise InputError(f"PushesConfig: tries must be at least 1 and highest above {LOW_CONTACT} m")
-
 
 class Pushes(PyTreeNode):
     """Pushes and their outcomes; every field has a leading axis for the pushes.

@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on

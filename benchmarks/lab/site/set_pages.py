@@ -18,7 +18,7 @@ import jinja2
 
 from mechsearch_jax.benchmarks.lab.site.results_page import table
 from mechsearch_jax.benchmarks.lab.site.set_texts import ABOUT, CLUTTER, About, sets_of
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
+from mechsearch_jax.benchmarks.statistics.preset_names import FORMER_STANDARDS
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, SceneSet, digest, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
