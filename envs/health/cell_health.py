@@ -1,5 +1,8 @@
 """Checks whether a search is possible in the cell of a configuration file: one line for each part of the cell."""
 
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import contextlib

@@ -293,7 +293,7 @@ def path_joints(
 def line_poses(
     T_base_gripper: Float[Numbers, "*batch 4 4"], distance: Float[Numbers, "*#batch"], waypoints: int
 ) -> Float[Array, "*batch waypoints 4 4"]:
-    """Evenly spaced gripper poses on the straight approach to a pose, from `distance` [m] back along its z, inclusive; two at least."""
+    """Two or more poses, evenly spaced on the straight way to a gripper pose from `distance` [m] back along its z."""
     ahead = still_ahead(waypoints)
     T = jnp.asarray(T_base_gripper, jnp.float32)
     distance = jnp.broadcast_to(jnp.asarray(distance, jnp.float32), T.shape[:-2])
