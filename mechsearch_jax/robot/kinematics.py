@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import back_off
 from mechsearch_jax.robot.arm_config import HOME, PANDA, Arm
+from mechsearch_jax.runtime.errors import InputError
 
 Numbers = Array | np.ndarray
 
@@ -293,7 +294,11 @@ def path_joints(
 def line_poses(
     T_base_gripper: Float[Numbers, "*batch 4 4"], distance: Float[Numbers, "*#batch"], waypoints: int
 ) -> Float[Array, "*batch waypoints 4 4"]:
-    """Two or more poses, evenly spaced on the straight way to a gripper pose from `distance` [m] back along its z."""
+    """Evenly spaced gripper poses on the straight approach to a pose, from `distance` [m] back along its z, inclusive.
+
+    Raises:
+      InputError: there are fewer than two waypoints.
+    """
     ahead = still_ahead(waypoints)
     T = jnp.asarray(T_base_gripper, jnp.float32)
     distance = jnp.broadcast_to(jnp.asarray(distance, jnp.float32), T.shape[:-2])
@@ -304,8 +309,11 @@ def line_poses(
 def still_ahead(waypoints: int) -> Float[np.ndarray, " {waypoints}"]:
     """Remaining share of a straight approach at its evenly spaced poses, both ends included: from 1 to 0.
 
-    There are at least two, see `MotionConfig`.
+    Raises:
+      InputError: there are fewer than two waypoints.
     """
+    if waypoints < 2:
+        raise InputError(f"straight approach: {waypoints} waypoints make no line; ask for at least 2")
     return np.linspace(1.0, 0.0, waypoints, dtype=np.float32)
 
 
@@ -321,11 +329,14 @@ def line_kinematics(
       T_base_gripper: pose of the gripper at the end of the approach, in the base frame.
       distance: length of the approach along the gripper's z [m].
       q7: angle of joint 7 [rad].
-      waypoints: number of poses on the line, both ends included, two at least.
+      waypoints: number of poses on the line, both ends included.
 
     Returns:
       q: joint angles [rad], the first row at the start of the approach, the last at the pose itself.
       reachable: whether one solution reaches all of them.
+
+    Raises:
+      InputError: there are fewer than two waypoints.
     """
     return path_kinematics(line_poses(T_base_gripper, distance, waypoints), q7)
 
