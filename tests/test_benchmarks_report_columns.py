@@ -28,7 +28,7 @@ from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, epis
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.known_target.search import InFullView, judge
+from mechsearch_jax.envs.known_target.judgement import InFullView, judge
 from mechsearch_jax.envs.page import page
 from mechsearch_jax.planner import PRESETS, PlannerConfig
 from mechsearch_jax.problem.workcell import Workcell

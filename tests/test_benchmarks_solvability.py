@@ -21,7 +21,8 @@ from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.envs.episode.records import ActionRecord
-from mechsearch_jax.envs.known_target.search import Judgement, KnownSearchConfig, KnownSearchResult, Node
+from mechsearch_jax.envs.known_target.judgement import Judgement
+from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError

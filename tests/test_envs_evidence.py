@@ -10,7 +10,7 @@ from recordings import EPISODE, LOST, OBJECTS, PUSH, RECORDING, SEQUENCES, SLOTS
 
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.envs.episode.numbering import named_tried
-from mechsearch_jax.envs.known_target.search import blocking, grasps_in_words, least_sets, objects_in_words
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets, objects_in_words
 from mechsearch_jax.envs.recording.evidence import Forecasts, foreseen_rows
 from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
 from mechsearch_jax.envs.recording.sampled import Sampled

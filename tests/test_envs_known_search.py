@@ -14,15 +14,8 @@ from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.known_target import search as known_search
-from mechsearch_jax.envs.known_target.search import (
-    Frontier,
-    InFullView,
-    Judgement,
-    KnownSearchConfig,
-    Node,
-    in_turn,
-    judge,
-)
+from mechsearch_jax.envs.known_target.judgement import InFullView, Judgement, judge
+from mechsearch_jax.envs.known_target.search import Frontier, KnownSearchConfig, Node, in_turn
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario

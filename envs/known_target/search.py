@@ -10,7 +10,6 @@ target has fallen, is discarded.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -21,134 +20,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, kind_of, no_action
-from mechsearch_jax.config.config import PlannerConfig, Weights
-from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.episode.records import ActionRecord, record_action
+from mechsearch_jax.envs.known_target.judgement import Judgement, judge, retrievals_of, sample
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World
-from mechsearch_jax.graspability import no_hits, pairs
-from mechsearch_jax.planner import Belief, PlanningPolicy, Problem, Sequences, initial_belief
-from mechsearch_jax.planner.objective import Objective, SearchForGrasp
-from mechsearch_jax.planner.rollout import plan, present_state
-from mechsearch_jax.retrieval import GraspChoice, best_grasps, found_grasps, found_hits
+from mechsearch_jax.planner import PlanningPolicy, Problem
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.scenario import Scenario
-
-# Largest number of sets of objects that are listed.
-MAX_LISTED = 3
-
-
-def least_sets(hits: Bool[np.ndarray, "grasps n"]) -> list[tuple[int, ...]]:
-    """The minimal sets of objects that grasps hit, the smallest first; empty without grasps.
-
-    Args:
-      hits: which objects each grasp hits, of grasps that arm and shelf allow.
-    """
-    sets = {frozenset(np.flatnonzero(row).tolist()) for row in hits}
-    minimal = [objects for objects in sets if not any(other < objects for other in sets)]
-    return sorted((tuple(sorted(objects)) for objects in minimal), key=lambda objects: (len(objects), objects))
-
-
-def blocking(hits: Bool[np.ndarray, "grasps n"]) -> tuple[int, ...]:
-    """The objects that the best grasps hit, those that hit the fewest objects."""
-    sets = least_sets(hits)
-    return tuple(sorted({index for objects in sets if len(objects) == len(sets[0]) for index in objects}))
-
-
-def grasps_in_words(hits: Bool[np.ndarray, "grasps n"]) -> str:
-    """What the grasps that arm and shelf allow meet."""
-    if not len(hits):
-        return "the arm can reach no grasp of the target inside the shelf"
-    sets = least_sets(hits)
-    listed = ", or ".join(map(objects_in_words, sets[:MAX_LISTED])) + (", or others" if len(sets) > MAX_LISTED else "")
-    if len(hits) == 1:
-        return f"the only grasp that the arm can reach inside the shelf hits {listed}"
-    return f"each of the {len(hits)} grasps that the arm can reach inside the shelf hits {listed}"
-
-
-def objects_in_words(indices: Sequence[int]) -> str:
-    """Objects by their numbers."""
-    return f"object{'s' if len(indices) > 1 else ''} {numbers_in_words(indices)}"
-
-
-def numbers_in_words(indices: Sequence[int]) -> str:
-    """Numbers as in a sentence."""
-    *others, last = map(str, indices)
-    return f"{', '.join(others)} and {last}" if others else last
-
-
-@dataclasses.dataclass(frozen=True)
-class InFullView(SearchForGrasp):
-    """The cost of `SearchForGrasp` for a target at a known pose, which may be hidden."""
-
-    def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
-        nowhere_hidden = jnp.zeros_like(state.exists)
-        return super().cost(problem, belief, state.replace(exists=nowhere_hidden), weights)
-
-
-class Judgement(PyTreeNode):
-    """How far the target of a world is from graspable, by the dense grasps of a found target.
-
-    Attributes:
-      cost: J of the planner, of this target alone.
-      feasible: which grasps arm and shelf allow, shape (F,).
-      hits: which objects each feasible grasp hits on its whole way, shape (F, N).
-    """
-
-    cost: Float[Array, "*batch"]
-    feasible: Bool[Array, "*batch f"]
-    hits: Bool[Array, "*batch f n"]
-
-    @property
-    def least(self) -> int | None:
-        """Number of objects that the best grasp hits; None if none is feasible. For a single world."""
-        return int(self.hits.sum(axis=1)[self.feasible].min()) if self.feasible.any() else None
-
-
-@functools.partial(jax.jit, static_argnames=("objective",))
-def judge(problem: Problem, objective: Objective, weights: Weights, world: World, active: Bool[Array, ""]) -> Judgement:
-    """How far the target of a world is from graspable.
-
-    Args:
-      problem: built for the target.
-      objective: defines the cost; static.
-      weights: of what is in the way of the grasp.
-      world: the true state, fields without leading axes.
-      active: if False, little is computed and the result means nothing.
-    """
-    snapshot = Snapshot(problem.camera, problem.shelf, world)
-    belief, objects = _certain_belief(problem, world, active), objects_on_the_board(snapshot)
-    hits = found_hits(problem.target_grasps, belief.grasps, objects, active)
-    rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
-    state = present_state(problem, belief, objects, PlannerConfig())
-    state = state.replace(exists=jnp.zeros_like(belief.exists), hits=rows)
-    cost = objective.cost(problem, belief, state, weights)
-    return Judgement(cost, belief.grasps.feasible, hits & belief.grasps.feasible[:, None])
-
-
-def _certain_belief(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
-    """The belief that holds the target's true pose as found."""
-    pose = true_target_pose(world)
-    grasps = found_grasps(problem.target_grasps, problem.target_grasps.standing(pose), active)
-    return initial_belief(problem).replace(found=jnp.array(True), found_pose=pose, grasps=grasps)
-
-
-@jax.jit
-def sample(policy: PlanningPolicy, key: Array, problem: Problem, world: World) -> Sequences:
-    """Sequences of actions from a world, best first, as the planner samples them."""
-    objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    return plan(policy.rollout(problem, _certain_belief(problem, world)), key, objects).sequences
-
-
-def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:
-    """The best grasps of the target of a world, as `best_grasps` ranks them, as NumPy arrays."""
-    objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    pose = true_target_pose(jax.tree.map(jnp.asarray, world))
-    return jax.device_get(best_grasps(problem.target_grasps, objects, pose, count))
-
 
 # Two worlds count as the same if no body differs in position by more than this [m].
 ALIKE = 0.01

@@ -20,7 +20,8 @@ from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.benchmarks.store.shards import result_tables
 from mechsearch_jax.envs.episode.episodes import target_of
-from mechsearch_jax.envs.known_target.search import InFullView, KnownSearchConfig, KnownSearchResult, Node, known_search
+from mechsearch_jax.envs.known_target.judgement import InFullView
+from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node, known_search
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.planner import PRESETS, Config, planning_policy

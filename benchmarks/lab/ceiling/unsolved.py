@@ -11,14 +11,9 @@ from jaxtyping import Bool
 from matplotlib.figure import Figure
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
-from mechsearch_jax.envs.known_target.search import (
-    Judgement,
-    KnownSearchResult,
-    Node,
-    blocking,
-    grasps_in_words,
-    least_sets,
-)
+from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets
+from mechsearch_jax.envs.known_target.judgement import Judgement
+from mechsearch_jax.envs.known_target.search import KnownSearchResult, Node
 from mechsearch_jax.envs.recording.pictures import colour_image
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.blockers import Moment, blockers_figure

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from mechsearch_jax.actions import Action
 from mechsearch_jax.benchmarks.lab.parts.agreement import draw_actions
 from mechsearch_jax.envs.camera.snapshot import true_target_pose
-from mechsearch_jax.envs.known_target.search import retrievals_of
+from mechsearch_jax.envs.known_target.judgement import retrievals_of
 from mechsearch_jax.envs.simulators.simulator import ARM, LAG, ROBOT
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES, from_scenario, true_superquadrics
