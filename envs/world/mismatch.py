@@ -87,7 +87,10 @@ class Mismatch:
     camera_turn: float = option(0.0, "by how much the camera is turned about itself [degrees]")
     shelf_shift: float = option(0.0, "how far the shelf stands from where it is taken to be [m]")
     shelf_turn: float = option(0.0, "by how much the shelf is turned about its middle [degrees]")
-    depth_noise: float = option(USUAL_NOISE, "standard deviation of the simulated depth camera's noise [m]")
+    depth_noise: float = option(
+        USUAL_NOISE,
+        "standard deviation by which noise moves points in a random direction, of which depth shows a part [m]",
+    )
     missing_depth: float = option(0.0, "share of pixels for which no depth is measured")
     colour_noise: float = option(USUAL_COLOUR_NOISE, "standard deviation of the colour camera's noise, from 0 to 1")
     exposure: float = option(1.0, "factor on the brightness of the simulated colour image")
