@@ -23,7 +23,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +37,7 @@ from mechsearch_jax.geometry.transforms import inverse, make, transform, upright
 from mechsearch_jax.images.measured import beside, unmeasured, veiled
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.detector import FOUND_PIXELS, found_pixels, longer
@@ -132,7 +132,7 @@ class ExistenceConfig:
         return int(found_pixels(camera, self.found_pixels) // self.step(camera) ** 2)
 
 
-class ExistenceTables(flax.struct.PyTreeNode):
+class ExistenceTables(PyTreeNode):
     """Constants of f in a `Problem`, for S places at each of X candidate poses.
 
     Attributes:
@@ -279,7 +279,7 @@ def _pixels_of(
     return project(camera, transform(T[..., None, :, :], points))[0]
 
 
-class ObjectViews(flax.struct.PyTreeNode):
+class ObjectViews(PyTreeNode):
     """Image and collisions of each object; after a motion only those of the moved objects are recomputed.
 
     Attributes:

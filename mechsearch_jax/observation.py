@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +9,10 @@ from jax.core import Tracer
 
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics, as_boxes
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 
-class Observation(flax.struct.PyTreeNode):
+class Observation(PyTreeNode):
     """The recognised scene at one moment; every field may have leading batch axes.
 
     Attributes:

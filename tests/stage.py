@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.planner import Decision, Sequences
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -125,7 +125,7 @@ class Stage(Simulator):
         return self.world
 
 
-class Grab(flax.struct.PyTreeNode):
+class Grab(PyTreeNode):
     """A policy: takes the target out as soon as it can be, and else pushes an object, by a random distance.
 
     Attributes:

@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks.lab.parts.agreement import (
     draw_actions,
     pose_differences,
 )
-from mechsearch_jax.benchmarks.lab.tables.parts_tables import agreement_table
+from mechsearch_jax.benchmarks.lab.tables import agreement_table
 from mechsearch_jax.benchmarks.parts import simulation
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError

@@ -12,7 +12,7 @@ from mechsearch_jax.benchmarks.lab.detection.detection import (
     total,
     worlds_of,
 )
-from mechsearch_jax.benchmarks.lab.tables.parts_tables import detection_table
+from mechsearch_jax.benchmarks.lab.tables import detection_table
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario

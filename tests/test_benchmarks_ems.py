@@ -87,5 +87,3 @@ def test_slots_without_points_are_absent():
     np.testing.assert_array_equal(scene.valid, [False, False, True, False])
     with pytest.raises(InputError, match="at least 11"):
         ems.recover(points[:5])
-    with pytest.raises(InputError):
-        ems.EmsConfig(outliers=1.0)

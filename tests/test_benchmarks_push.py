@@ -13,9 +13,9 @@ from rich.console import Console
 
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.lab import __main__ as lab
+from mechsearch_jax.benchmarks.lab import tables
 from mechsearch_jax.benchmarks.lab.parts import push
 from mechsearch_jax.benchmarks.lab.parts.push import MeasuredPushes, PushBench, held_out_generation, nudged, repeated
-from mechsearch_jax.benchmarks.lab.tables import parts_tables
 from mechsearch_jax.benchmarks.parts import bench
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands import main as cli
@@ -244,7 +244,7 @@ def rows_of(table):
 def test_the_tables_show_every_model_and_the_groups_of_the_best():
     measured = MeasuredPushes(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
     assert measured.best == "quasi-static"
-    group = parts_tables.push_scores_tables(measured)
+    group = tables.push_scores_tables(measured)
     models, distances, objects, _ = group.renderables
     numbers = ["-", "6.00", "0.500", "0.250"]
     assert rows_of(models) == [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.benchmarks.lab.reach.reach import bands, reach, save_reach
-from mechsearch_jax.benchmarks.lab.tables.parts_tables import reach_table
+from mechsearch_jax.benchmarks.lab.tables import reach_table
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.grasping.graspability import feasible_grasps, grasp_tables

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mechsearch_jax.benchmarks.lab import tables
 from mechsearch_jax.benchmarks.lab.commands import quality
 from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure, recognition_methods
 from mechsearch_jax.benchmarks.lab.parts.recognition import RecognitionBench, RecognitionRow
 from mechsearch_jax.benchmarks.lab.parts.recognition_methods import Method
-from mechsearch_jax.benchmarks.lab.tables import parts_tables
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
@@ -150,8 +150,8 @@ def test_tables_name_every_method_and_fit_a_terminal(measured):
     from rich.console import Console
 
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(parts_tables.recognition_tables(measured))
-    console.print(parts_tables.recognition_times_table(measured))
+    console.print(tables.recognition_tables(measured))
+    console.print(tables.recognition_times_table(measured))
     text = console.export_text()
     assert "…" not in text
     for name in METHODS:
@@ -221,7 +221,7 @@ def test_slow_methods_are_measured_on_scenes_spread_over_all(slow_scenes, expect
 
 def test_two_scenarios_of_one_name_are_refused():
     scenario = load_scenario(example_scenarios()["first-light"])
-    with pytest.raises(InputError, match="two scenarios have the name"):
+    with pytest.raises(InputError, match="two scenes are called"):
         images.scenes_of([scenario, scenario])
 
 

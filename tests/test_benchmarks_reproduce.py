@@ -29,8 +29,7 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
     screen,
 )
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
-from mechsearch_jax.benchmarks.running.evaluate import present_code
-from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, planned_jobs, present_code
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, wilson
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration
 from mechsearch_jax.benchmarks.store.shards import ShardWriter

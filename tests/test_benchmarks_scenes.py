@@ -11,7 +11,7 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
 from mechsearch_jax.benchmarks.lab.parts import scenes
 from mechsearch_jax.benchmarks.lab.parts.exact_existence import exact_existence
 from mechsearch_jax.benchmarks.lab.parts.scenes import SceneRow, look_at_all, nearest_pose, save_scenes, summary
-from mechsearch_jax.benchmarks.lab.tables.parts_tables import scenes_table
+from mechsearch_jax.benchmarks.lab.tables import scenes_table
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mechsearch_jax.benchmarks.lab import tables
 from mechsearch_jax.benchmarks.lab.parts import images, segmentation
 from mechsearch_jax.benchmarks.lab.parts.segmentation import SegmentationBench, overlaps, true_masks
-from mechsearch_jax.benchmarks.lab.tables import parts_tables
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
@@ -73,7 +73,7 @@ def test_results_are_written_with_their_rows(perfect, tmp_path):
 
 def test_the_table_shows_every_group(wrong):
     console = Console(file=io.StringIO(), width=120)
-    console.print(parts_tables.segmentation_tables(wrong.run()))
+    console.print(tables.segmentation_tables(wrong.run()))
     text = console.file.getvalue()
     assert "files scenes, clean" in text
     assert "files scenes, gaussian" in text

@@ -163,9 +163,9 @@ def test_what_a_run_did_not_judge_has_no_table():
 
 
 def test_a_variant_says_what_differs():
-    settings = {"actions": ["push"], "recognition": "masks", "rehearsal": "none"}
+    settings = {"actions": ["push"], "recognition": "masks", "trials": "none"}
     assert set_pages.label(line(2, 0.9, **settings)) == "`standard`, `masks`, push alone, without trials"
-    settings = {"actions": ["push", "pick-and-place"], "rehearsal": "learning"}
+    settings = {"actions": ["push", "pick-and-place"], "trials": "learning"}
     words = "push and pick-and-place alone, with trials that learn the friction"
     assert set_pages.label(line(2, 0.9, **settings)) == f"`standard`, {words}"
 

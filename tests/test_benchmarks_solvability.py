@@ -16,7 +16,7 @@ from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks.lab.ceiling import solvability, unsolved
 from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, read_outcomes, summary
 from mechsearch_jax.benchmarks.lab.ceiling.unsolved import blockers, in_the_way, reason
-from mechsearch_jax.benchmarks.lab.tables.parts_tables import ceiling_table
+from mechsearch_jax.benchmarks.lab.tables import ceiling_table
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.benchmarks.store.shards import ShardWriter

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mechsearch_jax.benchmarks.lab.tables.targets_table import targets_table
+from mechsearch_jax.benchmarks.lab.tables import targets_table
 from mechsearch_jax.benchmarks.lab.targets.antipodal import Approaches, Lines, crossings, gripper_poses, lines
 from mechsearch_jax.benchmarks.lab.targets.everyday import surface_of, write_things
 from mechsearch_jax.benchmarks.lab.targets.graspable import GivenMesh, TargetRow, TargetsBench, by_mesh, load, summary

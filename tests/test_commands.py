@@ -89,8 +89,8 @@ WRONG = {
         "--gama, 1; did you mean --gamma? (mechsearch search --help tells more)",
     ),
     "mismatch where nothing is simulated": (
-        ["inspect", "first-light", "--out", "maps", "--world-friction", "2"],
-        "inspect: simulates no world that could differ; leave --world-... and the like out",
+        ["inspect", "first-light", "--out", "maps", "--world", "friction=2"],
+        "inspect: simulates no world that could differ; leave --world out",
     ),
     "help of the subcommand": (["bench", "plan", "--batch", "x"], "(mechsearch bench plan --help tells more)"),
     "no configuration file": (["search", "good.json", "--out", "out", "--config", "none.toml"], "none.toml: cannot be"),
@@ -117,7 +117,7 @@ WRONG = {
     "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
     "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
-    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "named 'one-box'"),
+    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "two scenes are called one-box"),
     "results in a file": (
         ["evaluate", "good.json", "--out", "out/rows.parquet"],
         "rows.parquet: results are kept in a folder, not in a file",
@@ -212,7 +212,7 @@ WRONG = {
     "nothing to segment": (["lab", "segmentation", "--scenes", "0"], "there are no scenes"),
     "no picture of segments": (["lab", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
     "no picture": (["lab", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
-    "the same scene twice": (["lab", "recognition", "good.json", "good.json"], '"one-box"'),
+    "the same scene twice": (["lab", "recognition", "good.json", "good.json"], "two scenes are called one-box"),
     "picture of nothing": (
         ["lab", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
         "--worst-of network-refined is not among the methods",
@@ -370,9 +370,10 @@ def test_the_default_preset_is_the_standard():
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
 def test_every_option_of_the_configuration_is_one_of_the_command_line(option):
     usual = PRESETS["standard"]().options()[option.name]
-    given = [str(value) for value in (usual if isinstance(usual, list) else [usual])]
+    usual = tuple(option.outside(usual)) if isinstance(usual, list) else usual
+    given = [str(value) for value in (usual if isinstance(usual, tuple) else [usual])]
     parsed = options_of(f"--{option.name.replace('_', '-')}", *given)
-    assert getattr(parsed, option.name) == (tuple(usual) if isinstance(usual, list) else usual)
+    assert getattr(parsed, option.name) == usual
     assert parsed.settings().config == PRESETS["standard"]()
 
 
@@ -393,6 +394,20 @@ def test_what_is_no_option_any_more_is_refused_with_what_it_is_fixed_at(given):
         InputError, match=rf"^{name} is no option any more: it is fixed at [\d. ]+ \(in preset paper at "
     ):
         cli.parse(["evaluate", "first-light", "--out", "out", *given])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    {
+        "--rehearsal": "--rehearsal is called --trials now",
+        "--world-mass-spread": "--world-mass-spread is a key of --world now: mass_spread",
+        "--color-noise": "--color-noise is a key of --world now: colour_noise",
+        "--holes": "--holes is a key of --world now: holes",
+    }.items(),
+)
+def test_what_has_another_name_now_is_refused_with_it(given, message):
+    with pytest.raises(InputError, match=f"^{message}$"):
+        cli.parse(["evaluate", "first-light", "--out", "out", given, "2"])
 
 
 def test_help_names_options_with_their_defaults(capsys):

@@ -28,7 +28,7 @@ from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.session.searcher import Searcher
 
 WRITTEN = {"step.json", "step.png", "trajectory.csv", "trajectory.json"}
-FILES = {"depth.png", "color.png", "mask.png", "camera.json"}
+FILES = {"depth.png", "colour.png", "mask.png", "camera.json"}
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def see(problem, monkeypatch):
     [
         ((), "either --depth IMAGE or --example"),
         (("--depth", "d.png", "--example"), "either --depth IMAGE or --example"),
-        (("--example", "--mask", "m.png"), "leave --color, --mask and --camera out"),
+        (("--example", "--mask", "m.png"), "leave --colour, --mask and --camera out"),
         (("--depth", "d.png", "--target-id", "3"), "give --mask, too"),
         (("--depth", "missing.png"), "missing.png: cannot be read"),
     ],
@@ -108,7 +108,7 @@ def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_pa
     assert program(monkeypatch, "plan", "--example", "--out", str(out))[0] == 0
     assert {file.name for file in out.iterdir()} == WRITTEN | FILES
     assert load_camera(out / "camera.json") == IMAGES.camera
-    assert load_depth(out / "depth.png").shape == load_colour(out / "color.png").shape[:2]
+    assert load_depth(out / "depth.png").shape == load_colour(out / "colour.png").shape[:2]
     assert len(load_mask(out / "mask.png", 255)[1]) > 0
     step = json.loads((out / "step.json").read_text())
     assert step["kind"] == "retrieve"
@@ -122,7 +122,7 @@ def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_pa
     assert len(rows) == len(points)
 
     again = tmp_path / "again"
-    files = ("--depth", str(out / "depth.png"), "--color", str(out / "color.png"), "--mask", str(out / "mask.png"))
+    files = ("--depth", str(out / "depth.png"), "--colour", str(out / "colour.png"), "--mask", str(out / "mask.png"))
     arguments = (*files, "--target-id", "200", "--camera", str(out / "camera.json"), "--out", str(again))
     assert program(monkeypatch, "plan", *arguments)[0] == 0
     step_again = json.loads((again / "step.json").read_text())

@@ -4,6 +4,7 @@ take."""
 import dataclasses
 import itertools
 import json
+import math
 import re
 from pathlib import Path
 
@@ -15,14 +16,14 @@ from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
 from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, MeasuredSeconds, StoredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
-from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
-from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, make_jobs, planned_jobs, present_code
 from mechsearch_jax.benchmarks.store.runs import StoredRun, stored_runs
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.runs import outlines_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import find_set, recorded
+from mechsearch_jax.envs.world.mismatch import Mismatch
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
@@ -88,19 +89,49 @@ def test_a_sweep_of_one_point_is_what_evaluate_runs(jobs_of):
 
 def test_worlds_that_differ_are_swept_and_share_a_compilation(jobs_of):
     plain = jobs_of("sweep", "one.json")
-    jobs = jobs_of("sweep", "one.json", "--world-friction", "0.5", "1", "2", "--world-physics", "usual", "fine-step")
+    jobs = jobs_of("sweep", "one.json", "--world", "friction=0.5,1,2", "physics=usual,fine-step")
     expected = {(f, p) for f in (0.5, 1.0, 2.0) for p in ("usual", "fine-step")}
     assert {(job.method.mismatch.friction, job.method.mismatch.physics) for job in jobs} == expected
     assert len({job.method.compile_key() for job in jobs}) == 1
     assert len({job.key for job in jobs}) == len(jobs) == 6
     assert [job.key for job in jobs if job.method == Method()] == [job.key for job in plain]
-    (swept,), (evaluated,) = (jobs_of(command, "one.json", "--shelf-turn", "2") for command in ("sweep", "evaluate"))
+    (swept,), (evaluated,) = (
+        jobs_of(command, "one.json", "--world", "shelf_turn=2") for command in ("sweep", "evaluate")
+    )
     assert swept.key == evaluated.key
     assert swept.options["mismatch.shelf_turn"] == 2.0
     with pytest.raises(InputError, match="add --recognition masks or full"):
-        jobs_of("sweep", "one.json", "--missing-depth", "0.1")
+        jobs_of("sweep", "one.json", "--world", "missing_depth=0.1")
     with pytest.raises(InputError, match=r"camera_shift \(1.0\) must be from 0 to 0.2 m"):
-        jobs_of("evaluate", "one.json", "--camera-shift", "1")
+        jobs_of("evaluate", "one.json", "--world", "camera_shift=1")
+
+
+def test_a_file_has_a_table_of_worlds_and_what_is_given_goes_before_it(folder, jobs_of):
+    (folder / "sweep.toml").write_text(
+        'scenarios = "one.json"\n[world]\nmass = [1, 2]\narm_stop = 2\nholes = "objects"\n'
+    )
+    jobs = jobs_of("sweep", "--file", "sweep.toml", "--world", "holes=none,shadows")
+    stop = math.radians(2)
+    assert [job.method.mismatch for job in jobs] == [
+        Mismatch(mass=mass, arm_stop=stop, holes=holes) for mass in (1.0, 2.0) for holes in ("none", "shadows")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    {
+        ("friction=two",): "--world friction=two: is not a number$",
+        ("friction=1,2",): "--world friction=1,2: is not a number; several values are for mechsearch sweep",
+        ("friktion=2",): r"--world friktion=2: friktion is unknown; did you mean friction\?",
+        ("friction",): "--world friction: give a key and a value, as friction=2",
+        ("mass=1", "mass=2"): "--world mass=2: mass is given twice; a sweep takes several values as mass=1,2",
+        ("holes=some",): 'holes "some" is unknown; use none, objects',
+        ("arm_stop=0.03",): "arm_stop 0.03 is in degrees, of which 0.2 is the least; is it meant in radians",
+    }.items(),
+)
+def test_what_is_wrong_in_a_world_is_named(jobs_of, world, message):
+    with pytest.raises(InputError, match=message):
+        jobs_of("evaluate", "one.json", "--world", *world)
 
 
 def test_settings_that_come_to_the_same_are_run_once(jobs_of):
@@ -118,7 +149,7 @@ seed = [0, 1]
 gamma = [0.5, 1]
 horizon = 2
 push_distances = [[0.05, 0.1], [0.1]]
-push_directions = [1.5, -1.5]
+push_directions = [85, -85]
 move_target = [true, false]
 preset = ["standard"]
 recognition = "masks"
@@ -129,7 +160,7 @@ def test_a_file_says_it_all_and_what_is_given_goes_before_it(folder, jobs_of):
     (folder / "sweep.toml").write_text(FILE)
     jobs = jobs_of("sweep", "--file", "sweep.toml")
     assert len(jobs) == 16
-    fixed = {"horizon": 2, "push_directions": (1.5, -1.5)}
+    fixed = {"horizon": 2, "push_directions": (math.radians(85), math.radians(-85))}
     assert {job.method for job in jobs} == {
         Method("random", standard(gamma=gamma, push_distances=pushes, move_target=again, **fixed), "masks")
         for gamma, pushes, again in itertools.product((0.5, 1.0), ((0.05, 0.1), (0.1,)), (True, False))
@@ -162,6 +193,10 @@ def test_a_file_names_a_configuration(folder, jobs_of):
         "gamma = 1.5": "gamma 1.5 is outside",
         "recognition = 'eyes'": "recognition must be one of",
         "policy = 'none'": 'policy "none" is unknown',
+        "world_friction = 2": r"sweep.toml:1: world_friction: world_friction is a key of \[world\] now: friction",
+        "[world]\nmass = [1, 'x']": r"sweep.toml:2: \[world\] mass\[1\] must be a number",
+        "rehearsal = 'none'": "sweep.toml:1: rehearsal: rehearsal is called trials now",
+        "push_directions = [1.57, -1.57]": "push_directions 1.57 is in degrees, of which 4 is the least; is it meant",
         "gamma = ": "sweep.toml:1: is not TOML",
     }.items(),
 )
@@ -179,7 +214,8 @@ def test_a_list_in_a_flag_has_commas(jobs_of):
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
 def test_every_option_may_be_swept(option):
     usual = standard().options()[option.name]
-    given = ",".join(map(str, usual)) if isinstance(usual, list) else str(usual)
+    usual = option.outside(usual)
+    given = ",".join(map(str, usual)) if isinstance(usual, list | tuple) else str(usual)
     arguments = ("sweep", "first-light", "--out", "out", f"--{option.name.replace('_', '-')}", given, given)
     points = cli.parse(arguments).keywords["options"].points()
     assert [point.settings().config for point in points] == [standard()] * 2
@@ -197,8 +233,8 @@ def test_what_a_run_would_take_is_printed_and_nothing_is_run(folder, capsys):
     assert re.search(r"^  standard, oracle, with trials, native simulator: 192 x [\d.]+ s, 1 x ", output, re.M)
     cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
-    shifts = ("--recognition", "masks", "--camera-shift", "0.01", "0.02", "--depth-noise", "0.001", "0.002")
-    cli.parse(["sweep", *common, *shifts, "--world-mass", "1", "2"])()
+    shifts = ("--recognition", "masks", "--world", "camera_shift=0.01,0.02", "depth_noise=0.001,0.002")
+    cli.parse(["sweep", *common, *shifts, "mass=1,2"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
     cli.parse(["evaluate", *common, "--shard", "1/2"])()
     assert capsys.readouterr().out.startswith("1 variant, 1 episode, 0 of them there already, 1 left\n")
@@ -298,7 +334,7 @@ def test_outlines_of_sets_are_those_of_their_files(folder):
     assert (outline.name, len(outline.objects), outline.target.shape) == ("d1-003", 2, "cylinder")
     assert outline.content_hash == recorded()["d1"][3]
     assert [outline.name for outline in outlines_of(["one.json", "d3-4"])][:2] == ["one", "d3-4-000"]
-    with pytest.raises(InputError, match="two scenarios have the name 'd1-003'"):
+    with pytest.raises(InputError, match="two scenes are called d1-003"):
         planned_jobs([outline, outline], [Method()], (0,))
     with pytest.raises(InputError, match="no scenario is given"):
         outlines_of([])

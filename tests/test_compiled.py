@@ -368,10 +368,11 @@ SEARCH = """
 PERCEIVE = """
     import jax
     import mechsearch_jax as ms
+    from mechsearch_jax.problem.cache import cached_problem
 
     ms.keep_compilations()
     images = ms.example_images()
-    problem = ms.cached_problem()
+    problem = cached_problem()
     print(ms.Recogniser(problem)(jax.random.key(0), images.depth, images.colour).target_pose.tolist())
 """
 

@@ -12,7 +12,7 @@ import mechsearch_jax
 from mechsearch_jax.benchmarks.lab.site import results_page
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
-from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45
+from mechsearch_jax.benchmarks.statistics.preset_names import FROM_THE_FRONT, WITHIN_45
 from mechsearch_jax.benchmarks.store.runs import load_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded
 from mechsearch_jax.envs.world.mismatch import ASSUMED, MISMATCH_OPTIONS
@@ -143,9 +143,9 @@ def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
 
 
 def test_what_a_simulated_world_may_differ_in_is_all_there_with_its_default():
-    table = rows("docs/commands.md", "| option | what it sets | if not given |")
-    stated = {name: said(row[-1]) for row in table for name in re.findall(r"--([\w-]+)`", row[0])}
-    usual = {option.name.replace("_", "-"): getattr(ASSUMED, option.path[0]) for option in MISMATCH_OPTIONS}
+    table = rows("docs/commands.md", "| key of `--world` | what it sets | if not given |")
+    stated = {name: said(row[-1]) for row in table for name in re.findall(r"`(\w+)`", row[0])}
+    usual = {name: getattr(ASSUMED, name) for name in MISMATCH_OPTIONS}
     assert stated == usual
 
 

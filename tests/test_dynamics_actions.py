@@ -271,7 +271,7 @@ def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(InputError, match="push_distances"):
         ActionConfig(push_distances=())
     for directions in ((), (0.0, 0.0), (3.2,), (float("nan"),)):
-        with pytest.raises(InputError, match=r"push_directions .* one or more different angles within 3.1416 rad"):
+        with pytest.raises(InputError, match=r"push_directions .* different angles from -180 to 180 degrees"):
             ActionConfig(push_directions=directions)
     with pytest.raises(InputError, match=r"push_offsets .* shares from -1 to 1"):
         ActionConfig(push_offsets=(1.1,))

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from mechsearch_jax.envs.world.outcome import Failure, Overflow
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import static
 
 AT_ONCE = 2
 WON = Result(
@@ -111,7 +111,7 @@ class Counting(Grab):
     """The same, and counts how often it is traced; `tilt` is an array, `far` is static."""
 
     tilt: jax.Array | None = None
-    far: bool = flax.struct.field(pytree_node=False, default=False)
+    far: bool = static(default=False)
     traced = 0
 
     def __call__(self, *args):

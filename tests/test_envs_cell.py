@@ -6,7 +6,7 @@ import pytest
 
 from mechsearch_jax.envs.cell import loading as cell
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.runtime.compiled import _KEEPING
@@ -43,13 +43,15 @@ def test_a_file_says_workcell_and_planner(file):
     expected = Method(config=settings.config, workcell=settings.workcell).policy()
     policy = searcher._policy
     assert policy.config == expected.config
-    assert (policy.tries, searcher._trials) == (expected.tries, rehearsal("physics")) == (True, rehearsal("physics"))
+    assert policy.tries
+    assert expected.tries
+    assert searcher._trials == named_trials("physics")
     assert (policy.predict, policy.objective, policy.plan) == (expected.predict, expected.objective, expected.plan)
 
 
 def test_what_is_given_goes_before_the_file(file):
     camera = example_images().camera
-    searcher = cell.load_searcher(file, camera=camera, keep=False, rehearsal="none", max_steps=7, seed=3)
+    searcher = cell.load_searcher(file, camera=camera, keep=False, trials="none", max_steps=7, seed=3)
     assert searcher.workcell.camera == camera
     assert (searcher.config.max_steps, searcher.config.planner.gamma) == (7, 0.8)
     assert (searcher._policy.tries, searcher._trials) == (False, None)

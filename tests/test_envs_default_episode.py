@@ -51,7 +51,7 @@ def check(episode, engine):
     assert not episode.steps[0].found
     assert [step.failure for step in episode.steps] == [None] * len(episode.steps)
     assert len(episode.steps) <= 4
-    assert (episode.config["rehearsal"], episode.config["simulator"]) == ("physics", engine)
+    assert (episode.config["trials"], episode.config["simulator"]) == ("physics", engine)
 
 
 @pytest.mark.slow

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from stage import Grab, (
+from stage import (
     BOX,
     CYLINDER,
     HIDDEN,
     OPEN,
     TWO,
     UPRIGHT,
+    Grab,
     Shuffled,
     Stage,
     grab,

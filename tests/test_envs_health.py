@@ -9,8 +9,8 @@ import pytest
 
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
-from mechsearch_jax.envs.health import checks as health
-from mechsearch_jax.envs.health.finding import State
+from mechsearch_jax.envs.health import cell_health as health
+from mechsearch_jax.envs.health.cell_health import State
 from mechsearch_jax.networks import weights
 from mechsearch_jax.problem import cache
 from mechsearch_jax.problem.problem import NOWHERE
@@ -109,7 +109,7 @@ def test_the_default_cell_is_fine(problem, monkeypatch):
     assert "sees 100% of the board" in findings["camera"][0].says
     assert "can grasp the target at 95% of its 792" in findings["shelf"][0].says
     assert "recognition and segmentation" in findings["networks"][0].says
-    assert "rehearsal physics, push model learned, at most 10 actions" in findings["planner"][0].says
+    assert "trials physics, push model learned, at most 10 actions" in findings["planner"][0].says
 
 
 def test_a_cell_that_cannot_work_is_broken(problem, monkeypatch):

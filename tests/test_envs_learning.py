@@ -21,7 +21,7 @@ from mechsearch_jax.envs.simulators import native
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls
 from mechsearch_jax.envs.trials.learning import FRICTIONS, Hypothesis, LearningTrials
-from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, Mismatch
 from mechsearch_jax.envs.world.world import from_scenario
@@ -251,9 +251,9 @@ def test_each_of_many_slots_learns_from_its_own_action_and_assumes_what_it_learn
 
 
 def test_only_trials_that_learn_are_asked_to():
-    assert isinstance(rehearsal("learning"), LearnsFriction)
-    assert not isinstance(rehearsal("physics"), LearnsFriction)
-    assert restored(rehearsal("physics"), {}) is None
+    assert isinstance(named_trials("learning"), LearnsFriction)
+    assert not isinstance(named_trials("physics"), LearnsFriction)
+    assert restored(named_trials("physics"), {}) is None
 
 
 def test_what_was_learned_is_saved(problem, tmp_path):
@@ -271,7 +271,11 @@ TWO = LearningTrials(hypotheses=(Hypothesis(), Hypothesis(2.0)))
 @pytest.mark.parametrize(
     ("trials", "values", "message"),
     [
-        (rehearsal("learning"), (0.5, 0.5), "friction 1, mass 1; friction 2, mass 1 were learned, but the trials have"),
+        (
+            named_trials("learning"),
+            (0.5, 0.5),
+            "friction 1, mass 1; friction 2, mass 1 were learned, but the trials have",
+        ),
         (NativeTrials(), (0.5, 0.5), "the trials learn nothing"),
         (TWO, (math.nan, 0.5), "impossible"),
         (TWO, (-0.5, 1.5), "impossible"),
@@ -279,7 +283,7 @@ TWO = LearningTrials(hypotheses=(Hypothesis(), Hypothesis(2.0)))
     ],
 )
 def test_what_other_trials_learned_or_is_damaged_is_not_loaded(problem, trials, values, message, tmp_path):
-    saver, loader = Searcher(rehearsal=TWO), Searcher(rehearsal=trials)
+    saver, loader = Searcher(trials=TWO), Searcher(trials=trials)
     saver.problem = loader.problem = problem
     saver._state = dataclasses.replace(
         beginning(problem), hypothesis_probabilities=dict(zip(TWO.names, values, strict=True))
@@ -291,7 +295,7 @@ def test_what_other_trials_learned_or_is_damaged_is_not_loaded(problem, trials, 
 
 
 def test_what_was_learned_goes_on(problem, tmp_path):
-    saver, loader = Searcher(rehearsal=TWO), Searcher(rehearsal=TWO)
+    saver, loader = Searcher(trials=TWO), Searcher(trials=TWO)
     saver.problem = loader.problem = problem
     learned = dict(zip(TWO.names, (0.25, 0.75), strict=True))
     saver._state = dataclasses.replace(beginning(problem), hypothesis_probabilities=learned)
@@ -303,7 +307,7 @@ def test_what_was_learned_goes_on(problem, tmp_path):
 @pytest.mark.parametrize("ok", [True, False])
 def test_a_searcher_learns_from_actions_that_were_executed_to_their_end(problem, ok):
     before, after = pushed(problem, 2.0)
-    searcher = Searcher(rehearsal=LearningTrials(NativeTrials(threads=1)))
+    searcher = Searcher(trials=LearningTrials(NativeTrials(threads=1)))
     searcher.problem = problem
     searcher._state = dataclasses.replace(beginning(problem), observation=before, action=PUSH, handed=True)
     searcher.acted(ok=ok)
@@ -400,7 +404,7 @@ def test_predictions_stop_where_the_arm_does(problem):
 
 def test_episodes_of_an_arm_that_stops_learn_with_its_bound():
     stops, usual = (
-        Method(config=standard(rehearsal="learning"), mismatch=Mismatch(arm_stop=bound)) for bound in (0.03, 0.0)
+        Method(config=standard(trials="learning"), mismatch=Mismatch(arm_stop=bound)) for bound in (0.03, 0.0)
     )
     assert stops.trials().arm_stop == 0.03
     assert usual.trials().arm_stop == SimulatorConfig().tracking_bound

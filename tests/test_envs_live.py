@@ -65,7 +65,7 @@ BOX = Observation(jax.tree.map(jnp.asarray, OBJECTS), jnp.array(False), jnp.zero
 def test_decisions_are_the_same_with_a_view_and_it_is_shown_each(problem):
     noting, steps = Noting(), []
     for view in (None, noting):
-        searcher = searcher_of(problem, BOX, policy=comparing, rehearsal=refusing, view=view)
+        searcher = searcher_of(problem, BOX, policy=comparing, trials=refusing, view=view)
         steps.append(searcher.next(IMAGES.depth))
     plain, shown = ((step.kind, step.reason, step.warnings, step.decision, step.belief) for step in steps)
     assert plain[:3] == shown[:3]

@@ -148,9 +148,6 @@ def test_what_cannot_be_in_line_is_one_line():
     thin = LineGenerator(LineConfig(radius=(0.005, 0.006), attempts=5), GeneratorConfig(visible=100))
     with pytest.raises(InputError, match="mine: no scene fits in 5 attempts"):
         thin.generate(0, "mine")
-    for wrong in ({"radius": (0.0, 0.1)}, {"height": (0.2, 0.1)}, {"gap": -1.0}, {"attempts": 0}):
-        with pytest.raises(InputError, match=next(iter(wrong))):
-            LineConfig(**wrong)
 
 
 def test_names_of_scenes():

@@ -21,7 +21,7 @@ from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
-from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.trials.order import in_order
@@ -126,12 +126,12 @@ def look(problem, objects, found=True):
 @pytest.fixture(scope="module")
 def retrievals(problem):
     """What there is to be tried in each scene to take the target out, and what becomes of it."""
-    rehearsed = {}
+    by_name = {}
     for name, objects in SCENES.items():
         seen, at = objects_and_pose(problem, objects)
         tried = top_grasps(problem.target_grasps, seen, at)
-        rehearsed[name] = tried, results_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
-    return rehearsed
+        by_name[name] = tried, results_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
+    return by_name
 
 
 def test_the_grasps_that_are_tried_differ_and_the_clearest_come_first(problem, retrievals):
@@ -195,7 +195,7 @@ def test_a_retrieval_is_tried_in_each_scene_nearby_until_it_fails_and_a_push_onc
         assert len(called) == len(set(map(id, called))) == calls
 
 
-def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, retrievals):
+def test_what_the_trials_say_is_what_the_simulator_does(problem, retrievals):
     world = NativeWorld()
     for name in ("loose", "firm"):
         tried, results = retrievals[name]
@@ -666,11 +666,11 @@ def test_what_is_not_touched_sleeps(problem):
 
 
 def test_names():
-    assert rehearsal("none") is None
-    assert rehearsal("physics") is rehearsal("physics")
-    assert rehearsal("physics") == MODEL
-    for refuse in (rehearsal, lambda name: dataclasses.replace(Config(), rehearsal=name)):
-        with pytest.raises(InputError, match='rehearsal "guess" is unknown; use none, physics'):
+    assert named_trials("none") is None
+    assert named_trials("physics") is named_trials("physics")
+    assert named_trials("physics") == MODEL
+    for refuse in (named_trials, lambda name: dataclasses.replace(Config(), trials=name)):
+        with pytest.raises(InputError, match='trials "guess" is unknown; use none, physics'):
             refuse("guess")
     # What is tried out is simulated as it is executed.
     assert MODEL.simulation == NativeWorld().config

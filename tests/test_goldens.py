@@ -20,12 +20,12 @@ def net(monkeypatch):
     return module
 
 
-def test_the_goldens_cover_rehearsals_as_the_default_has_them(net):
+def test_the_goldens_cover_trials_as_the_default_has_them(net):
     jobs = net.episode_jobs()
     assert len({(Path(file).stem, *rest) for file, *rest in jobs}) == len(jobs)
-    default = Method().config.rehearsal
+    default = Method().config.trials
     for recognition in net.RECOGNITIONS:
-        rehearsed = {r for _, method, seen, r in jobs if (method, seen) == ("search-for-grasp", recognition)}
-        assert rehearsed == ({default, "none"} if recognition == "oracle" else {default})
+        tried = {r for _, method, seen, r in jobs if (method, seen) == ("search-for-grasp", recognition)}
+        assert tried == ({default, "none"} if recognition == "oracle" else {default})
     assert ("search-and-grasp", "oracle", default) in {tuple(rest) for _, *rest in jobs}
-    assert PRESETS["standard"](rehearsal="none") != PRESETS["standard"](rehearsal=default)
+    assert PRESETS["standard"](trials="none") != PRESETS["standard"](trials=default)

@@ -195,7 +195,7 @@ MISTAKES = {
     "configuration: millimetres": lambda tmp: settings(tmp, "[shelf]\nfront = 414\n"),
     "configuration: degrees": lambda tmp: settings(tmp, "[arm]\nhome = [0, -84, 0, -140, 8, 132, 40]\n"),
     "configuration: back before front": lambda tmp: settings(tmp, "[shelf]\nback = 0.3\n"),
-    "configuration: a target without a hue": lambda tmp: settings(tmp, "[target]\ncolor = [0.5, 0.5, 0.5]\n"),
+    "configuration: a target without a hue": lambda tmp: settings(tmp, "[target]\ncolour = [0.5, 0.5, 0.5]\n"),
     "configuration: no TOML": lambda tmp: settings(tmp, "[camera\n"),
     "joints: degrees": lambda tmp: check_joints("joints", np.array([0.0, -84, 0, -140, 8, 132, 40])),
     "joints: six, or NaN": lambda tmp: check_joints("joints", np.zeros(6)),

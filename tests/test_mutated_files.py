@@ -267,7 +267,7 @@ def test_two_scenarios_of_one_name_do_not_overwrite_each_others_maps(tmp_path, m
         (tmp_path / name).write_text(text)
     status, message = program(monkeypatch, "inspect", str(tmp_path), "--out", str(tmp_path / "out"))
     assert status == 2
-    assert "b.json: another scenario is called first-light" in message
+    assert "two scenes, and their maps, are called first-light" in message
 
 
 def test_an_archive_that_unpacks_to_too_much_is_refused():

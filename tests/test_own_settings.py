@@ -9,6 +9,7 @@ import mechsearch_jax as ms
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.runtime.compiled import CachedJit
 from mechsearch_jax.runtime.own_settings import OWN, in_own_settings, own_settings
+from mechsearch_jax.workspace.render import render_depth
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def test_a_search_is_the_same_under_other_settings(problem, others):
         assert np.dtype(np.float64) not in dtypes(result)
     motion = ms.joint_trajectory(problem, decision.action, observation=observation)
     assert motion.position.dtype == np.float32
-    ms.render_depth(images.camera, objects)
+    render_depth(images.camera, objects)
     # As without them.
     with own_settings():
         plain = ms.Observation(

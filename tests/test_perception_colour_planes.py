@@ -153,9 +153,6 @@ def test_configurations_refuse_what_makes_no_sense():
     for wrong in (
         lambda: TargetColour(rgb=(2.0, 0.0, 0.0)),
         lambda: TargetColour(threshold=0.0),
-        lambda: colour.ClusterConfig(depth=0.0),
-        lambda: planes.PlaneConfig(hypotheses=0),
-        lambda: planes.PlaneConfig(within=0.0),
     ):
         with pytest.raises(InputError):
             wrong()

@@ -111,7 +111,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
         "push_model": "learned",
-        "rehearsal": "physics",
+        "trials": "physics",
         "max_steps": 10,
     }
     # What is no option.
@@ -144,7 +144,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
     assert (config.problem.retrieval.yaws, config.problem.retrieval.max_yaw) == (25, np.radians(45))
     assert actions.grasps.tilts == (np.radians(20),)
-    assert config.rehearsal == "none"
+    assert config.trials == "none"
     # Where the paper is silent.
     assert search.gamma == planner.standard().planner.gamma
     assert planner.paper(gamma=0.5).planner.gamma == 0.5

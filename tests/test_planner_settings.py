@@ -112,11 +112,11 @@ def test_the_targets_place_is_in_the_frame_of_the_shelf_but_joint_angles_are_not
 
 
 def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_path):
-    workcell = load(tmp_path, '[target]\nshape = "box"\ncolor = [0, 0.2, 1]').workcell
+    workcell = load(tmp_path, '[target]\nshape = "box"\ncolour = [0, 0.2, 1]').workcell
     assert workcell == Workcell(target=Target.box(), colour=(0.0, 0.2, 1.0))
     assert workcell.detector == TargetColour.lit((0.0, 0.2, 1.0))
-    assert load(tmp_path, "[target]\ncolor = [0, 0.2, 1]").workcell.target == Target()
-    hue = load(tmp_path, "[target]\ncolor = {hue = 240, saturation = 0.8}\nhue_tolerance = 20").workcell
+    assert load(tmp_path, "[target]\ncolour = [0, 0.2, 1]").workcell.target == Target()
+    hue = load(tmp_path, "[target]\ncolour = {hue = 240, saturation = 0.8}\nhue_tolerance = 20").workcell
     np.testing.assert_allclose(hue.colour, (0.2, 0.2, 1.0))
     assert hue.detector == TargetColour.lit(hue.colour, 20.0)
     setting = types.SimpleNamespace(camera=Camera(), shelf=Shelf(), target=Target())
@@ -126,14 +126,14 @@ def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_pa
 
 
 WRONG = {
-    "[target]\ncolor = [255, 0, 0]": ":2: [target] color (255.0, 0.0, 0.0) must be red, green and blue, each",
-    "[target]\n\ncolor = [1, 1, 1]": ":3: [target] color (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
-    "[target]\ncolor = {hue = 40, saturation = 0.1}": ":2: [target] color saturation 0.1 is too grey",
-    "[target]\ncolor = {hue = 400, saturation = 1}": ":2: [target] color: hue (400.0) must be from 0 to 360 degrees",
-    "[target]\ncolor = {hue = 40}": ":2: [target] color must be red, green and blue, or {hue = DEGREES",
+    "[target]\ncolour = [255, 0, 0]": ":2: [target] colour (255.0, 0.0, 0.0) must be red, green and blue, each",
+    "[target]\n\ncolour = [1, 1, 1]": ":3: [target] colour (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
+    "[target]\ncolour = {hue = 40, saturation = 0.1}": ":2: [target] colour saturation 0.1 is too grey",
+    "[target]\ncolour = {hue = 400, saturation = 1}": ":2: [target] colour: hue (400.0) must be from 0 to 360 degrees",
+    "[target]\ncolour = {hue = 40}": ":2: [target] colour must be red, green and blue, or {hue = DEGREES",
     "[target]\nhue_tolerance = 90": ":2: [target] hue_tolerance (90.0) must be from 1 to 60 degrees",
-    "[target]\ncolor = [1, 1]": ":2: [target] color must be a list of 3, not of 2",
-    "[target]\ncolour = [1, 0, 0]": ":2: [target] colour is unknown; did you mean color?",
+    "[target]\ncolour = [1, 1]": ":2: [target] colour must be a list of 3, not of 2",
+    "[target]\ncolor = [1, 0, 0]": ":2: [target] color is called colour now",
     "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
     "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base]: position x (-14.9) must be from",
     "[base]\nposition = [5, 0, 0]\n[arm]\nplace = [0.4, 0, 0]": ":4: [arm] place [-4.6, 0.0, 0.0] must be x, y and z",
@@ -163,6 +163,9 @@ WRONG = {
     "[objects]\nboxes = [[100, 50, 50]]": ":2: [objects] boxes (100.0, 50.0, 50.0) must be lengths in metres",
     '[planner]\npreset = "papr"': ':2: [planner] preset must be one of "standard", "paper"',
     '[planner]\npush_model = "eye"': ':2: [planner] push_model must be one of "quasi-static"',
+    "[planner]\nrehearsal = 'none'": ":2: [planner] rehearsal: rehearsal is called trials now",
+    "[planner]\npush_directions = [1.5]": ":2: [planner] push_directions 1.5 is in degrees, of which 4 is the least",
+    "[calibration]\nwarn_turn = 0.007": ":2: [calibration] warn_turn 0.007 is in degrees, of which 0.05 is the least",
     '[planner]\ncriterion = "detector"': ":2: [planner] criterion: criterion is no option any more: it is fixed",
     "[planner]\nhorizon = 3\ngamma = 3": ":3: [planner] gamma 3.0 is outside",
     '[planner]\nactions = ["fly"]': ':2: [planner] actions: "fly" is unknown',

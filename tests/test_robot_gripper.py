@@ -7,11 +7,11 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mechsearch_jax.envs.health.checks import robot_meshes
+from mechsearch_jax.envs.health.cell_health import robot_meshes
 from mechsearch_jax.geometry.swept_cloud import mesh_of
 from mechsearch_jax.robot import gripper as module
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import FINGER, HAND, LINKS, Gripper, RobotPart
+from mechsearch_jax.robot.gripper import Gripper, RobotPart, finger_parts, hand_parts, link_parts
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -20,7 +20,7 @@ Q7 = float(np.pi / 4)
 # z of the finger tips' ends in the gripper frame [m].
 TIP = 0.009
 COLLISION = robot_meshes()
-BOUNDED = {"hand": HAND, "finger": FINGER, "link6": LINKS[5], "link7": LINKS[6]}
+BOUNDED = {"hand": hand_parts(), "finger": finger_parts(), "link6": link_parts()[5], "link7": link_parts()[6]}
 
 
 def signed_distance(primitive: RobotPart, points: np.ndarray, swept: float = 0.0) -> np.ndarray:
@@ -69,16 +69,16 @@ def test_the_real_surface_lies_inside_the_primitives_and_at_most_8_mm_beneath(bo
 def test_the_arm_lies_inside_its_capsules(link):
     mesh = trimesh.load(COLLISION / f"link{link}.stl", force="mesh")
     points = np.concatenate([mesh.vertices, trimesh.sample.sample_surface(mesh, 5000, seed=0)[0]])
-    distance = union_distance(LINKS[link - 1], points)
-    assert all(primitive.kind == "capsule" for primitive in LINKS[link - 1])
+    distance = union_distance(link_parts()[link - 1], points)
+    assert all(primitive.kind == "capsule" for primitive in link_parts()[link - 1])
     assert distance.max() <= 0.0
     assert np.quantile(distance, 0.05) > -0.03
 
 
 def test_the_fingers_face_each_other_at_the_opening():
     primitives = module.primitives_in_gripper(GRIPPER, 0.06, Q7)
-    left = primitives[len(HAND) : len(HAND) + len(FINGER)]
-    right = primitives[len(HAND) + len(FINGER) : len(HAND) + 2 * len(FINGER)]
+    left = primitives[len(hand_parts()) : len(hand_parts()) + len(finger_parts())]
+    right = primitives[len(hand_parts()) + len(finger_parts()) : len(hand_parts()) + 2 * len(finger_parts())]
     y = np.linspace(-0.05, 0.05, 2001)
     middle = np.stack([0 * y, y, 0 * y], axis=-1)
     free = y[(union_distance(left, middle) > 0) & (union_distance(right, middle) > 0) & (np.abs(y) < 0.04)]
@@ -91,9 +91,9 @@ def test_links_6_and_7_sit_where_the_kinematics_put_them(q7):
     q[6] = q7
     frames = np.asarray(kinematics.forward_kinematics(q), np.float64)
     T_gripper_base = np.linalg.inv(np.asarray(kinematics.gripper_pose(q), np.float64))
-    placed = module.primitives_in_gripper(GRIPPER, 0.0, q7)[len(HAND) + 2 * len(FINGER) :]
-    expected = [frames[6] @ one.T_frame_primitive for one in LINKS[6]]
-    expected += [frames[5] @ one.T_frame_primitive for one in LINKS[5]]
+    placed = module.primitives_in_gripper(GRIPPER, 0.0, q7)[len(hand_parts()) + 2 * len(finger_parts()) :]
+    expected = [frames[6] @ one.T_frame_primitive for one in link_parts()[6]]
+    expected += [frames[5] @ one.T_frame_primitive for one in link_parts()[5]]
     for primitive, T_base_primitive in zip(placed, expected, strict=True):
         np.testing.assert_allclose(primitive.T_frame_primitive, T_gripper_base @ T_base_primitive, atol=1e-5)
 
@@ -147,12 +147,12 @@ def bounding_box(primitives: tuple[RobotPart, ...]) -> tuple[np.ndarray, np.ndar
 
 def test_boxes_hold_the_fingers_and_the_hand():
     primitives = module.primitives_in_gripper(GRIPPER, 0.08, 0.0)
-    half_size, centre = bounding_box(primitives[len(HAND) : len(HAND) + 2 * len(FINGER)])
+    half_size, centre = bounding_box(primitives[len(hand_parts()) : len(hand_parts()) + 2 * len(finger_parts())])
     np.testing.assert_allclose(centre[:2], (0.0, 0.0), atol=1e-3)
     assert centre[2] + half_size[2] == pytest.approx(TIP, abs=1e-3)
     assert half_size[1] == pytest.approx(0.04 + 0.0267, abs=1e-3)
     cloud = module.gripper_cloud(GRIPPER, 0.08, Q7, 2000)
-    hand_half, hand_centre = bounding_box(primitives[: len(HAND)])
+    hand_half, hand_centre = bounding_box(primitives[: len(hand_parts())])
     fingers = cloud[cloud[:, 2] > hand_centre[2] + hand_half[2] + 1e-3]
     assert (np.abs(fingers - centre) <= half_size + 1e-3).all()
     assert hand_half[1] > 0.1
@@ -181,7 +181,7 @@ def test_arm_points_lie_on_the_capsules_axes():
     assert points.shape == (len(radii), 3)
     start = 0
     for link in range(1, 5):
-        for capsule in LINKS[link]:
+        for capsule in link_parts()[link]:
             axis = frames[link] @ capsule.T_frame_primitive
             np.testing.assert_allclose(points[start + 1], axis[:3, 3], atol=1e-5)
             ends = axis[:3, 3] + np.array([[-1.0], [1.0]]) * capsule.size[1] * axis[:3, 2]

@@ -264,19 +264,19 @@ def test_where_the_arm_cannot_do_what_was_decided_on_others_are_drawn(problem):
 
 def test_what_a_policy_does_not_propose_cannot_be_tried(problem):
     with pytest.raises(InputError, match="the policy proposes nothing to be tried; make it with tries=True"):
-        Searcher(policy=search_for_grasp(), rehearsal=NativeTrials())
-    assert Searcher(policy=search_for_grasp(tries=True), rehearsal=NativeTrials())._policy.tries
+        Searcher(policy=search_for_grasp(), trials=NativeTrials())
+    assert Searcher(policy=search_for_grasp(tries=True), trials=NativeTrials())._policy.tries
     with pytest.raises(InputError, match="push_model would have no effect"):
         Searcher(policy=idle, push_model=QuasiStatic())
 
 
 def test_an_option_that_would_have_no_effect_is_refused():
     for policy in (None, search_for_grasp(tries=True)):
-        with pytest.raises(InputError, match=r"one that learns nothing is given; give rehearsal=LearningTrials\(\)"):
-            Searcher(config=standard(rehearsal="learning"), rehearsal=NativeTrials(), policy=policy)
-    Searcher(config=standard(rehearsal="learning"), rehearsal=LearningTrials())
+        with pytest.raises(InputError, match=r"others that learn nothing are given; give trials=LearningTrials\(\)"):
+            Searcher(config=standard(trials="learning"), trials=NativeTrials(), policy=policy)
+    Searcher(config=standard(trials="learning"), trials=LearningTrials())
     with pytest.raises(InputError, match='config names the push model "quasi-static", and another is given'):
-        Searcher(config=standard(rehearsal="none", push_model="quasi-static"), push_model=own_push_model("learned"))
+        Searcher(config=standard(trials="none", push_model="quasi-static"), push_model=own_push_model("learned"))
 
 
 def test_what_a_configuration_names_is_what_decides_by_default():
@@ -284,8 +284,8 @@ def test_what_a_configuration_names_is_what_decides_by_default():
     searcher = Searcher()
     assert searcher.config == method.config
     assert (searcher._policy, searcher._trials) == (method.policy(), method.trials())
-    assert isinstance(Searcher(config=standard(rehearsal="learning"))._trials, LearningTrials)
-    physics = Searcher(config=standard(rehearsal="none", push_model="physics"))
+    assert isinstance(Searcher(config=standard(trials="learning"))._trials, LearningTrials)
+    physics = Searcher(config=standard(trials="none", push_model="physics"))
     assert physics._trials is None
     assert isinstance(physics._policy.predict.push_model, NativePhysics)
     # A policy tries what it proposes; a user's may do without.
@@ -295,7 +295,7 @@ def test_what_a_configuration_names_is_what_decides_by_default():
 
 def test_what_a_configuration_names_and_a_slot_holds_decides():
     simulated = NativeTrials()
-    searcher = Searcher(config=standard(gamma=0.5, push_model="quasi-static"), rehearsal=simulated)
+    searcher = Searcher(config=standard(gamma=0.5, push_model="quasi-static"), trials=simulated)
     assert searcher._trials is simulated
     assert searcher._policy.tries
     assert searcher._policy.config.gamma == 0.5
@@ -303,7 +303,7 @@ def test_what_a_configuration_names_and_a_slot_holds_decides():
 
 
 def test_where_nothing_is_tried_out_it_says_so(problem):
-    plain, bold = Searcher(config=standard(rehearsal="none")), Searcher()
+    plain, bold = Searcher(config=standard(trials="none")), Searcher()
     for searcher in (plain, bold):
         searcher.problem, searcher.recogniser = problem, lambda *images: seen(OPEN)
     assert "no action is tried out before it is made" in plain.check().notices[0]
@@ -434,10 +434,10 @@ def one_push(rollout, key, objects):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rehearsal", ["none", "physics"])
-def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
+@pytest.mark.parametrize("trials", ["none", "physics"])
+def test_after_warming_up_nothing_is_compiled(problem, trials, monkeypatch):
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
-    searcher = load_searcher(keep=False, rehearsal=rehearsal, sequences=4, horizon=1, trajectories=TRUSTING)
+    searcher = load_searcher(keep=False, trials=trials, sequences=4, horizon=1, trajectories=TRUSTING)
     searcher.problem, searcher._policy = problem, searcher._policy.replace(plan=one_push)
     stages = []
     searcher.warm_up(lambda what, left: stages.append((what, left)))

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +27,7 @@ from mechsearch_jax.networks.push_contacts import REACH, pusher_distance
 from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, PushStart, push_start
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.train.push_scores import PushTruth, model_scores, no_motion, push_truth, turn_error
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
 from mechsearch_jax.workspace.shelf import Shelf
@@ -130,7 +130,7 @@ def blurred(key: Key[Array, ""], start: PushStart, blur: float) -> PushStart:
     return start.replace(prints=prints.replace(position=position, yaw=yaw))
 
 
-class PushExample(flax.struct.PyTreeNode):
+class PushExample(PyTreeNode):
     """The network's inputs for pushes, and the true motion."""
 
     start: PushStart

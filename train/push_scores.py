@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from mechsearch_jax.envs.world.world import superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -29,7 +29,7 @@ HALF_TURN = np.pi
 DISTANCES, WITHIN = (0.05, 0.10, 0.15), 0.025
 
 
-class PushTruth(flax.struct.PyTreeNode):
+class PushTruth(PyTreeNode):
     """True motion of the bodies; fields have the leading axes (..., 9).
 
     Attributes:
@@ -138,7 +138,7 @@ def model_scores(
     return outcome_scores(predictions(model, pushes, pusher, shelf, batch), pushes)
 
 
-class _Compared(flax.struct.PyTreeNode):
+class _Compared(PyTreeNode):
     """Predictions next to the truth; fields have the leading axes (pushes, 9)."""
 
     shift_error: jax.Array

@@ -8,7 +8,6 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +33,7 @@ from mechsearch_jax.networks.recognition import (
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.recognition import best_hypothesis
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
@@ -76,7 +76,7 @@ def _cube_symmetries() -> np.ndarray:
 SYMMETRIES = _cube_symmetries()
 
 
-class Truth(flax.struct.PyTreeNode):
+class Truth(PyTreeNode):
     """A true body in a segment's frame; every field may have leading axes.
 
     Attributes:
@@ -94,7 +94,7 @@ class Truth(flax.struct.PyTreeNode):
     surface: jax.Array
 
 
-class Example(flax.struct.PyTreeNode):
+class Example(PyTreeNode):
     """Segments and their true bodies; every field has the leading axis of the batch.
 
     Attributes:
@@ -108,7 +108,7 @@ class Example(flax.struct.PyTreeNode):
     weight: jax.Array
 
 
-class Answers(flax.struct.PyTreeNode):
+class Answers(PyTreeNode):
     """The right answer of every hypothesis for one true body.
 
     Attributes:
@@ -306,7 +306,7 @@ def tear(key: Key[Array, ""], labels: Int[Array, "h w"], reach: int = 2) -> Int[
     return jnp.where((labels >= 0) & (other >= 0), other, labels)
 
 
-class _Scored(flax.struct.PyTreeNode):
+class _Scored(PyTreeNode):
     overlap: jax.Array
     centre: jax.Array
     right: jax.Array

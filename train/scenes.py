@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.images.cloud import View, shelf_view
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape, shape_of
 from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
@@ -89,7 +89,7 @@ def origin(config: SceneConfig) -> dict[str, Any]:
     return {"source": "random scenes, ray-cast as they were needed", **dataclasses.asdict(config), "noises": noises}
 
 
-class Footprint(flax.struct.PyTreeNode):
+class Footprint(PyTreeNode):
     """Footprints of bodies, seen from above: a rectangle, or a disc if `radius` is not 0.
 
     Attributes:
@@ -139,7 +139,7 @@ def gap(a: Footprint, b: Footprint) -> Float[Array, "..."]:
     return apart - a.radius - b.radius
 
 
-class _Shape(flax.struct.PyTreeNode):
+class _Shape(PyTreeNode):
     """A body at the origin, its lowest point at height 0: shape, orientation and footprint."""
 
     kind: jax.Array
@@ -289,7 +289,7 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
     )
 
 
-class Capture(flax.struct.PyTreeNode):
+class Capture(PyTreeNode):
     """A sensor's image of a scene.
 
     Attributes:

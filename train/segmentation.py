@@ -7,7 +7,6 @@ import functools
 from pathlib import Path
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from mechsearch_jax.networks.segmentation import SegmentationConfig, Segmentatio
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
 from mechsearch_jax.workspace.shelf import Shelf
@@ -32,7 +32,7 @@ _EARLIER = 0.5
 _UNIT = 0.05
 
 
-class Example(flax.struct.PyTreeNode):
+class Example(PyTreeNode):
     """Labelled clouds; every field has the leading axis of the batch.
 
     Attributes:

@@ -21,7 +21,7 @@ from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.files import PathLike, read_json
 from mechsearch_jax.runtime.versions import versions
 
 REFERENCE = Path(__file__).parents[1] / "results" / "guard-cpu.json"
@@ -249,13 +249,9 @@ def read_reference(path: PathLike) -> Reference:
       InputError: the file cannot be read, or is something else.
     """
     try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}); write a reference with --write"
-        ) from error
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
+        value = read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; write a reference with --write") from error
     try:
         outcomes = [Outcome(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
         return Reference(value["code"], outcomes)

@@ -13,7 +13,6 @@ import math
 from types import ModuleType
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -26,9 +25,10 @@ from mechsearch_jax.planner import PlannerConfig, PlanningPolicy, search_for_gra
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 
-class Node(flax.struct.PyTreeNode):
+class Node(PyTreeNode):
     """A node of the tree.
 
     Attributes:

@@ -19,7 +19,7 @@ from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.simulators.named import EngineName, new_simulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.trials.learning import LearningTrials
-from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.planner.trials import Trials
@@ -115,7 +115,7 @@ class Batches:
             while batches:
                 batch = batches.pop()
                 try:
-                    trials = trying(*method.rehearsal)
+                    trials = trying(*method.trials_arguments)
                     self._run(batch, failures.ended, _Means(target, method, simulator, worlds, trials))
                 except InputError:
                     raise
@@ -165,8 +165,8 @@ class Batches:
 
 
 def _trials(stack: contextlib.ExitStack, name: str, arm_stop: float = 0.0) -> Trials | None:
-    """What tries actions out, as `rehearsal`, in processes of its own beside a GPU; ended with the stack."""
-    trials = rehearsal(name, arm_stop)
+    """What tries actions out, as `named_trials`, in processes of its own beside a GPU; ended with the stack."""
+    trials = named_trials(name, arm_stop)
     native = trials.trials if isinstance(trials, LearningTrials) else trials
     if jax.default_backend() == "cpu" or not isinstance(native, NativeTrials):
         return trials

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechsearch_jax.benchmarks.statistics.settings import THREE_AHEAD, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import THREE_AHEAD, settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.episode.method import Method
@@ -107,7 +107,7 @@ def kind_of(options: Mapping[str, Any] | str) -> Kind:
 @functools.lru_cache(maxsize=4096)
 def _kind_of(configuration: str) -> Kind:
     options = json.loads(configuration)
-    trials = options.get("rehearsal", "none") != "none"
+    trials = options.get("trials", "none") != "none"
     simulator = options.get("simulator", "NativeSimulator")
     return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials, simulator)
 

@@ -18,8 +18,7 @@ from mechsearch_jax.benchmarks.running.episode_seconds import (
     nearest,
     stored_seconds,
 )
-from mechsearch_jax.benchmarks.running.evaluate import check_code
-from mechsearch_jax.benchmarks.running.planned import PlannedJob
+from mechsearch_jax.benchmarks.running.evaluate import PlannedJob, check_code
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.method import MISMATCH_PREFIX, Method

@@ -15,7 +15,7 @@ from typing import Any, Protocol, get_args, get_origin, get_type_hints
 import pyarrow
 import pyarrow.parquet
 
-from mechsearch_jax.config.fixed import AS_IN_PAPER
+from mechsearch_jax.config.fixed import AS_IN_PAPER, renamed
 from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.runtime.errors import InputError
@@ -263,7 +263,7 @@ def configuration(options: Mapping[str, Any]) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _options(text: str) -> Mapping[str, Any]:
-    """The options that a `EpisodeRow.configuration` holds.
+    """The options that a `EpisodeRow.configuration` holds, by the names that this version has.
 
     Raises:
       ValueError: it is not a JSON object.
@@ -271,7 +271,7 @@ def _options(text: str) -> Mapping[str, Any]:
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("not an object")
-    return value
+    return renamed(value)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import colorsys
 import math
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float, Key
 from mechsearch_jax.envs.camera.simulated_camera import LIGHT, PALETTE, SHELF, Appearance
 from mechsearch_jax.envs.world.mismatch import USUAL_COLOUR_NOISE, USUAL_HUE_GAP
 from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Ranges from which the objects' saturation and brightness are drawn: from grey to pure, from dark to bright.
 SATURATIONS, BRIGHTNESSES = (0.0, 0.9), (0.25, 0.95)
@@ -23,7 +23,7 @@ LIGHT_SPREAD = 0.3
 LEVELS = 255
 
 
-class ColourSensing(flax.struct.PyTreeNode):
+class ColourSensing(PyTreeNode):
     """How a colour camera and the colours before it are; all numbers are data.
 
     Attributes:

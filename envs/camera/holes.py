@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Key
 from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, Image
 from mechsearch_jax.envs.world.mismatch import HolesName
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 
 USUAL_FX = Camera().fx
@@ -32,7 +32,7 @@ WAVES, PATCH, CLUMP = 32, 160.0, 12.0
 CLUMPED = 2 / 3
 
 
-class Holes(flax.struct.PyTreeNode):
+class Holes(PyTreeNode):
     """What of a depth image is not measured; each may be traced.
 
     Attributes:
@@ -65,7 +65,7 @@ HOLES: Mapping[HolesName, Holes] = MappingProxyType(
 )
 
 
-class DrawnHoles(flax.struct.PyTreeNode):
+class DrawnHoles(PyTreeNode):
     """The holes of an episode: the same at every look, for the same image.
 
     Attributes:

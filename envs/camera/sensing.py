@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from typing import TypeVar
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,12 +22,13 @@ from mechsearch_jax.geometry.footprints import extents
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, matmul, transform
 from mechsearch_jax.images.noise import scattered
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera, back_project
 
 Bodies = TypeVar("Bodies", World, Superquadrics)
 
 
-class Place(flax.struct.PyTreeNode):
+class Place(PyTreeNode):
     """Where the world is in the planner's frame, which is that of the robot's base; see `Mismatch`.
 
     Attributes:
@@ -40,7 +40,7 @@ class Place(flax.struct.PyTreeNode):
     T_seen_world: jax.Array | np.ndarray
 
 
-class OtherNoise(flax.struct.PyTreeNode):
+class OtherNoise(PyTreeNode):
     """The `NoiseModel` like `noise.RandomDirection`, but with pixels without a measurement, and all numbers data.
 
     Attributes:
@@ -58,7 +58,7 @@ class OtherNoise(flax.struct.PyTreeNode):
         return jnp.where(lost[..., None], jnp.nan, points)
 
 
-class Sensing(flax.struct.PyTreeNode):
+class Sensing(PyTreeNode):
     """How what is seen in an episode differs from what the planner assumes.
 
     Attributes:
@@ -86,7 +86,7 @@ def sensing_of(mismatch: Mismatch, cell: TrueCell) -> Sensing | None:
     if mismatch.measures_otherwise:
         noise = OtherNoise(*(np.asarray(n, np.float32) for n in (mismatch.depth_noise, mismatch.missing_depth)))
     if mismatch.colours_otherwise:
-        numbers = (mismatch.color_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
+        numbers = (mismatch.colour_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
         colour = ColourSensing(*(np.asarray(n, np.float32) for n in numbers))
     if mismatch.resizes:
         sizes = np.asarray(cell.seen_size[:TARGET], np.float32)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from functools import partial
 from operator import add, sub
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from mechsearch_jax.envs.world.model import shelf_corners
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import MOST_SOLIDS
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
@@ -56,7 +56,7 @@ USUAL_HALF_SIZE = (0.02, 0.02, 0.05)
 _BOARD = shape_of("box")
 
 
-class Image(flax.struct.PyTreeNode):
+class Image(PyTreeNode):
     """An image of the shelf.
 
     Attributes:
@@ -71,7 +71,7 @@ class Image(flax.struct.PyTreeNode):
     colour: jax.Array
 
 
-class Appearance(flax.struct.PyTreeNode):
+class Appearance(PyTreeNode):
     """How the bodies and the shelf look.
 
     Attributes:

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 from typing import Protocol, runtime_checkable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -21,6 +20,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -34,7 +34,7 @@ NEAR_TARGET = 0.03
 NEARLY = 0.05
 
 
-class Sight(flax.struct.PyTreeNode):
+class Sight(PyTreeNode):
     """The part of a camera's view of a shelf that array shapes depend on, computed on the host.
 
     Attributes:
@@ -43,7 +43,7 @@ class Sight(flax.struct.PyTreeNode):
     """
 
     view: View | None
-    window: int = flax.struct.field(pytree_node=False)
+    window: int = static()
 
 
 def sight_of(camera: Camera, shelf: Shelf, target: Target | None = None) -> Sight:
@@ -126,7 +126,7 @@ class Detects(Protocol):
     def detects_target(self) -> bool: ...
 
 
-class Truth(flax.struct.PyTreeNode):
+class Truth(PyTreeNode):
     """What a look truly shows, for verdicts and records; the planner does not know it.
 
     Attributes:
@@ -222,7 +222,7 @@ def _seen_objects(snapshot: Snapshot) -> tuple[Superquadrics, Bool[Array, ""], F
     if snapshot.sensing is not None and snapshot.sensing.noise is not None:
         raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
     if snapshot.sensing is not None and snapshot.sensing.colour is not None:
-        raise InputError("color_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
+        raise InputError("colour_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
     objects = as_seen(resized(objects_on_the_board(snapshot), snapshot.sensing), snapshot.sensing)
     if snapshot.sensing is None or snapshot.sensing.holes is None:
         return objects, jnp.array(True), None

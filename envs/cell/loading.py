@@ -4,7 +4,7 @@
 
     searcher = load_searcher("mine.toml")
 
-Rehearsal and push model of the configuration are built here, since they may need the simulator, which the planner must
+Trials and push model of the configuration are built here, since they may need the simulator, which the planner must
 not import.
 """
 
@@ -22,7 +22,7 @@ from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.robot.arm_config import ArmModel
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.session.searcher import Searcher
-from mechsearch_jax.session.view import View
+from mechsearch_jax.session.step import View
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 
@@ -43,7 +43,7 @@ def load_searcher(
 ) -> Searcher:
     """A `Searcher` with the workcell and all planner options of a configuration file.
 
-    It plans as `mechsearch search` does with that file, including its push model, rehearsal and `max_steps`. Compiled
+    It plans as `mechsearch search` does with that file, including its push model, trials and `max_steps`. Compiled
     functions and the problem are kept on disk, so that the next process starts in seconds.
 
     Args:
@@ -55,7 +55,7 @@ def load_searcher(
       seed: of all random numbers.
       recogniser, trajectories, view: as for a `Searcher`.
       keep: whether this process keeps what it compiles from now on; see `keep_compilations`.
-      **options: planner options that override the file's, such as `rehearsal="none"`.
+      **options: planner options that override the file's, such as `trials="none"`.
 
     Raises:
       InputError: the file cannot be used, an option is impossible, or the camera does not see the shelf.
@@ -99,4 +99,4 @@ def searcher_of(
     if arm is not None:
         workcell = workcell.with_arm(arm)
     method = Method(policy, settings.config, workcell=workcell)
-    return Searcher(workcell, settings.config, policy=method.policy(), rehearsal=method.trials(), **arguments)
+    return Searcher(workcell, settings.config, policy=method.policy(), trials=method.trials(), **arguments)

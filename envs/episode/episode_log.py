@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,12 +19,13 @@ from mechsearch_jax.envs.world.touching import unrest
 from mechsearch_jax.envs.world.world import TARGET, World, fallen_over
 from mechsearch_jax.planner import Decision
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
 
-class Choice(flax.struct.PyTreeNode):
+class Choice(PyTreeNode):
     """A policy's decision without the sequences that it did not choose.
 
     Attributes:

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from mechsearch_jax.planner.step import SearchState, believe, propose, unsearche
 from mechsearch_jax.planner.trials import TrialResult, Trials, TrialScenes, TwoStagePolicy, choose, scenes_of
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.session.preparing import Program, program
 
 
@@ -55,7 +55,7 @@ HIDDEN, FOUND, RETRIEVAL = Question("planned", hidden=True), Question("planned")
 ANYTHING = Question("__call__")
 
 
-class SlotState(flax.struct.PyTreeNode):
+class SlotState(PyTreeNode):
     """What the planner knows in every slot, and the truth of its looks; fields have a leading axis for the slots."""
 
     search: SearchState

@@ -14,7 +14,7 @@ from mechsearch_jax.envs.camera.snapshot import Recogniser
 from mechsearch_jax.envs.episode.policy_numbers import compile_key
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.named import EngineName
-from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
 from mechsearch_jax.planner.trials import Trials
@@ -63,17 +63,17 @@ class Method:
             self.config.planner,
             push_model=first,
             later_push_model=later,
-            tries=self.config.rehearsal != "none",
+            tries=self.config.trials != "none",
         )
 
     def trials(self) -> Trials | None:
-        """The trials of the policy's best actions; None without a rehearsal."""
-        return rehearsal(*self.rehearsal)
+        """The trials of the policy's best actions; None without trials."""
+        return named_trials(*self.trials_arguments)
 
     @property
-    def rehearsal(self) -> tuple[str, float]:
-        """The arguments of `trials.named.rehearsal`: its name, and for one that learns where the arm stops [rad]."""
-        return self.config.rehearsal, self.mismatch.arm_stop if self.config.rehearsal == "learning" else 0.0
+    def trials_arguments(self) -> tuple[str, float]:
+        """The arguments of `named_trials`: the trials' name, and for those that learn where the arm stops [rad]."""
+        return self.config.trials, self.mismatch.arm_stop if self.config.trials == "learning" else 0.0
 
     def recogniser(self, target: Target) -> Recogniser:
         """The recogniser of its episodes with a target.
@@ -93,7 +93,7 @@ class Method:
           InputError: as `policy`.
         """
         shared = self.workcell, self.config.problem, self.recognition, self.engine
-        return *shared, self.rehearsal, self.mismatch.compile_key(), compile_key(self.policy())
+        return *shared, self.trials_arguments, self.mismatch.compile_key(), compile_key(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.config.fixed import renamed
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.files import PathLike, read_json, replacing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,12 +166,7 @@ def load_episode(path: PathLike) -> Episode:
     Raises:
       InputError: the file cannot be read or is not the record of an episode.
     """
-    try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
+    value = read_json(path)
     try:
         return episode_of(value)
     except (TypeError, KeyError) as error:
@@ -184,7 +179,8 @@ def episode_of(value: Any) -> Episode:
     Raises:
       TypeError, KeyError: they are of something else.
     """
-    return Episode(**{**value, "steps": tuple(_step(step) for step in value["steps"])})
+    steps = tuple(_step(step) for step in value["steps"])
+    return Episode(**{**value, "steps": steps, "config": renamed(value["config"])})
 
 
 def _step(value: Any) -> Step:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -18,6 +17,7 @@ from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasps, found_gr
 from mechsearch_jax.planner import Belief, PlanningPolicy, Problem, Sequences, initial_belief
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
 from mechsearch_jax.planner.rollout import plan, present_state
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,7 @@ class InFullView(SearchForGrasp):
         return super().cost(problem, belief, state.replace(exists=nowhere_hidden), weights)
 
 
-class Judgement(flax.struct.PyTreeNode):
+class Judgement(PyTreeNode):
     """How far the target of a world is from graspable, by the dense grasps of a found target.
 
     Attributes:

@@ -26,7 +26,7 @@ _SOURCES = (Path(__file__), _TEMPLATE, _VALUES, _VALUES.with_name("step_values.h
 # Of WebP.
 QUALITY = 75
 # Options of an episode that its card names.
-_OPTIONS = {"policy": "policy", "recognition": "recognition", "rehearsal": "trials", "seed": "seed"}
+_OPTIONS = {"policy": "policy", "recognition": "recognition", "trials": "trials", "seed": "seed"}
 
 
 def check_page_path(path: Path) -> None:

@@ -10,8 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from flax import serialization
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import unflatten_dict
 from jaxtyping import Array
 
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, generate_pushes
@@ -27,8 +26,8 @@ def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    state = flatten_dict(serialization.to_state_dict(pushes), sep="/")
-    arrays = {name: value for name, value in state.items() if value is not None}
+    leaves, _ = jax.tree_util.tree_flatten_with_path(pushes)
+    arrays = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
     with replacing(path) as file:
         np.savez(file, identity=np.array(identity), **arrays)  # pyright: ignore[reportArgumentType]
 

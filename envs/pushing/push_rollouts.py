@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import mujoco
 import mujoco.rollout
@@ -24,6 +23,7 @@ from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES, World, bodies_of
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf, on_host
 
@@ -32,7 +32,7 @@ LOOSE, LOOSE_TURN = 5e-4, 0.01
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
-class Poses(flax.struct.PyTreeNode):
+class Poses(PyTreeNode):
     """Poses of bodies, with any leading axes; NumPy arrays on the host.
 
     Attributes:
@@ -44,7 +44,7 @@ class Poses(flax.struct.PyTreeNode):
     rotation: Any
 
 
-class Simulated(flax.struct.PyTreeNode):
+class Simulated(PyTreeNode):
     """Simulated pushes, with any leading axes; NumPy arrays on the host.
 
     Attributes:

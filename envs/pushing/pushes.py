@@ -11,7 +11,6 @@ import functools
 import math
 from collections.abc import Callable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +30,7 @@ from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
 from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
@@ -71,18 +71,8 @@ class PushesConfig:
     renewed: float = 0.2
     renewed_toppled: float = 0.7
 
-    def __post_init__(self):
-        for name in ("sideways", "planned", "renewed", "renewed_toppled"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"PushesConfig: {name} {getattr(self, name)} must be between 0 and 1")
-        for name in ("lengths", "gap"):
-            if not 0 < getattr(self, name)[0] <= getattr(self, name)[1]:
-                raise InputError(f"PushesConfig: {name} {getattr(self, name)} must be a range of positive numbers")
-        if self.tries < 1 or not self.highest > LOW_CONTACT:
-            raise InputError(f"PushesConfig: tries must be at least 1 and highest above {LOW_CONTACT} m")
 
-
-class Pushes(flax.struct.PyTreeNode):
+class Pushes(PyTreeNode):
     """Pushes and their outcomes; every field has a leading axis for the pushes.
 
     Attributes:
@@ -124,7 +114,7 @@ def push_tables(config: PushesConfig, gripper: Gripper | None = None) -> ActionT
     return action_tables(gripper or Gripper(), config.actions.push_wrists, config.actions)
 
 
-class _Try(flax.struct.PyTreeNode):
+class _Try(PyTreeNode):
     """A push that was drawn, and whether it is possible."""
 
     action: Action

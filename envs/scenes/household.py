@@ -49,7 +49,7 @@ def _piece(entry: dict[str, Any]) -> Piece:
 
 def _thing(name: str, entry: dict[str, Any]) -> Thing:
     pieces = tuple(_piece(piece) for piece in entry["pieces"])
-    red, green, blue = (float(c) for c in entry["color"])
+    red, green, blue = (float(c) for c in entry["colour"])
     compound, _ = centred(Compound(pieces, float(entry["density"]), float(entry["friction"]), (red, green, blue)))
     least, most = (float(factor) for factor in entry["scale"])
     return Thing(name, compound, (least, most))

@@ -39,14 +39,6 @@ class LineConfig:
     gap: float = 0.005
     attempts: int = 1000
 
-    def __post_init__(self):
-        for name in ("radius", "height"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise InputError(f"LineConfig: {name} {(low, high)} must be a range of positive lengths in metres")
-        if self.gap < 0 or self.attempts < 1:
-            raise InputError("LineConfig: gap must be at least 0 and attempts at least 1")
-
 
 class LineGenerator:
     """Makes 3-object scenes; the same seed gives the same scene on the same machine."""

@@ -17,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -39,6 +38,7 @@ from mechsearch_jax.envs.world.world import (
     from_scenario,
 )
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import PRIMITIVES, in_order
 from mechsearch_jax.shapes.compound import CONVEX_CODE, Compound, Piece
 from mechsearch_jax.workspace.scenario import Scenario
@@ -51,7 +51,7 @@ _EMPTY = Compound(tuple(Piece(name, _TINY) for name, count in ROWS.items() for _
 ROOM: Mapping[int, Compound] = MappingProxyType(dict.fromkeys(range(TARGET), _EMPTY))
 
 
-class BodyFields(flax.struct.PyTreeNode):
+class BodyFields(PyTreeNode):
     """Fields of the model that depend on the bodies' shapes and on the cell, with a leading axis for the worlds.
 
     Names, units and further axes (bodies, geoms, degrees of freedom) are those of MJX's model.
@@ -71,7 +71,7 @@ class BodyFields(flax.struct.PyTreeNode):
     body_gravcomp: jax.Array
 
 
-class Cells(flax.struct.PyTreeNode):
+class Cells(PyTreeNode):
     """How the worlds differ from what the planner assumes: what of an `TrueCell` this simulator's model holds.
 
     Attributes:

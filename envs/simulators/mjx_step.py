@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,13 +19,14 @@ from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.robot.kinematics import gripper_pose
 from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.shelf import Shelf
 
 # A state with larger numbers has diverged; the same bound as in C MuJoCo.
 LARGEST = 1e10
 
 
-class Task(flax.struct.PyTreeNode):
+class Task(PyTreeNode):
     """The task of every world; fields have a leading axis for the worlds, `controls` one for time before it.
 
     Attributes:
@@ -53,7 +53,7 @@ class Task(flax.struct.PyTreeNode):
     idle: jax.Array
 
 
-class Progress(flax.struct.PyTreeNode):
+class Progress(PyTreeNode):
     """Progress of every world; fields have a leading axis for the worlds.
 
     Attributes:

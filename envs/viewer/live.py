@@ -47,7 +47,7 @@ _LAYERS = (*(name for name in VISIBLE if name != "true"), "recognised")
 
 
 class LiveView:
-    """A `session.view.View` in the browser. Steps are drawn in a thread, so that the search need not wait.
+    """A `session.step.View` in the browser. Steps are drawn in a thread, so that the search need not wait.
 
     Attributes:
       url: address of the page.
@@ -84,7 +84,7 @@ class LiveView:
         self.close()
 
     def decided(self, step: SearchStep, tried: TriedActions) -> None:
-        """Show a step, and then its planned motion; see `session.view.View`."""
+        """Show a step, and then its planned motion; see `session.step.View`."""
         self._submit(lambda: self._show(step, tried))
 
     def acted(self, step: SearchStep, ok: bool) -> None:

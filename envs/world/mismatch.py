@@ -8,8 +8,8 @@ stand where its workcell says, and the camera to look from where its workcell sa
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Hashable, Mapping
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -60,7 +60,7 @@ class Mismatch:
         shift [m], and a turn [degrees] about the middle of the board.
       depth_noise: standard deviation of the measured points' distance from the true ones [m].
       missing_depth: share of pixels without a measurement, below 1.
-      color_noise: standard deviation of each channel of the colour image, in shares of full brightness.
+      colour_noise: standard deviation of each channel of the colour image, in shares of full brightness.
       exposure: factor on all channels of the colour image.
       white_balance: share by which red is too strong in it and blue too weak.
       hue_gap: least difference of the objects' hues from the target's [degrees]; 0 for any colour.
@@ -79,17 +79,22 @@ class Mismatch:
     )
     physics: PhysicsName = option("usual", "contacts and time step of the simulated world", get_args(PhysicsName))
     arm_stop: float = option(
-        0.0, "joint error at which the simulated arm stops and goes back [rad]; 0.03 or more; 0: never"
+        0.0,
+        "joint error at which the simulated arm stops and goes back [degrees], 1.7 or more; 0: never",
+        least_degrees=0.2,
     )
     camera_shift: float = option(0.0, "how far the camera stands from where it is taken to be [m]")
     camera_turn: float = option(0.0, "by how much the camera is turned about itself [degrees]")
     shelf_shift: float = option(0.0, "how far the shelf stands from where it is taken to be [m]")
     shelf_turn: float = option(0.0, "by how much the shelf is turned about its middle [degrees]")
-    depth_noise: float = option(USUAL_NOISE, "standard deviation of the simulated depth camera's noise [m]")
+    depth_noise: float = option(
+        USUAL_NOISE,
+        "standard deviation by which noise moves points in a random direction, of which depth shows a part [m]",
+    )
     missing_depth: float = option(0.0, "share of pixels for which no depth is measured")
-    color_noise: float = option(USUAL_COLOUR_NOISE, "standard deviation of the simulated color camera's noise, 0 to 1")
-    exposure: float = option(1.0, "factor on the brightness of the simulated color image")
-    white_balance: float = option(0.0, "share by which red is too strong and blue too weak in the color image")
+    colour_noise: float = option(USUAL_COLOUR_NOISE, "standard deviation of the colour camera's noise, from 0 to 1")
+    exposure: float = option(1.0, "factor on the brightness of the simulated colour image")
+    white_balance: float = option(0.0, "share by which red is too strong and blue too weak in the colour image")
     hue_gap: float = option(USUAL_HUE_GAP, "least difference of the objects' hues from the target's [degrees]")
     holes: HolesName = option(
         "none", "what the simulated depth camera does not measure, in connected holes", get_args(HolesName)
@@ -109,7 +114,7 @@ class Mismatch:
             ("shelf_turn", 0.0, STEEPEST, "degrees"),
             ("depth_noise", 0.0, 1.0, "m"),
             ("missing_depth", 0.0, 0.99, ""),
-            ("color_noise", 0.0, 1.0, ""),
+            ("colour_noise", 0.0, 1.0, ""),
             ("exposure", 0.01, 100.0, ""),
             ("white_balance", -0.9, 0.9, ""),
             ("hue_gap", 0.0, 180.0, "degrees"),
@@ -145,7 +150,7 @@ class Mismatch:
     def colours_otherwise(self) -> bool:
         """Whether the colour image differs from the usual."""
         usual = USUAL_COLOUR_NOISE, 1.0, 0.0, USUAL_HUE_GAP
-        return (self.color_noise, self.exposure, self.white_balance, self.hue_gap) != usual
+        return (self.colour_noise, self.exposure, self.white_balance, self.hue_gap) != usual
 
     @property
     def simulates_otherwise(self) -> bool:
@@ -166,19 +171,19 @@ class Mismatch:
           InputError: they cannot.
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
-            raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
+            raise InputError("depth_noise and missing_depth need an image; add --recognition masks or full")
         if recognition not in ("oracle", "informed") and self.resizes:
             raise InputError(
-                "--size-spread: shapes from images are off by themselves; take --recognition oracle or informed"
+                "size_spread: shapes from images are off by themselves; take --recognition oracle or informed"
             )
         if recognition not in ("full", "full-parts") and self.colours_otherwise:
             raise InputError(
-                "--color-noise, --exposure, --white-balance and --hue-gap need a colour image; add --recognition full"
+                "colour_noise, exposure, white_balance and hue_gap need a colour image; add --recognition full"
             )
         if engine != "NativeSimulator" and self.physics != "usual":
-            raise InputError("--world-physics: the batch simulator has the usual physics; add --simulator native")
+            raise InputError("physics: the batch simulator has the usual physics; add --simulator native")
         if engine != "NativeSimulator" and self.arm_stop:
-            raise InputError("--arm-stop: the batch simulator's arm never stops; add --simulator native")
+            raise InputError("arm_stop: the batch simulator's arm never stops; add --simulator native")
 
     def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> TrueCell:
         """The cell of an episode, constant until its end.
@@ -254,13 +259,7 @@ def _motion(shift: np.ndarray, turn: np.ndarray, pivot: np.ndarray) -> Float[np.
     return T
 
 
-def _option(field: dataclasses.Field[Any]) -> Option:
-    # `--world-...` is what is simulated, the others what is seen.
-    of_world = ("friction", "mass", "friction_spread", "mass_spread", "physics")
-    name = f"world_{field.name}" if field.name in of_world else field.name
-    choices = field.metadata["choices"]
-    return Option(name, (field.name,), str if choices else float, field.metadata["help"], choices)
-
-
-# On the command line; paths lead from a `Mismatch`.
-MISMATCH_OPTIONS: tuple[Option, ...] = tuple(map(_option, dataclasses.fields(Mismatch)))
+# By the name that `--world` has for them; paths lead from a `Mismatch`.
+MISMATCH_OPTIONS: Mapping[str, Option] = {
+    field.name: Option.of_field(field, float) for field in dataclasses.fields(Mismatch)
+}

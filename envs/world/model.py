@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.robot.arm_config import ARMS
-from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, RobotPart
+from mechsearch_jax.robot.gripper import FINGER_BASE, RobotPart, finger_parts, hand_parts, link_parts
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINTS
 from mechsearch_jax.shapes import PRIMITIVES, Shape, by_shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, inertial, solids
@@ -260,7 +260,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
             damping=text(ARM_DAMPING),
             armature="0.1",
         )
-        _solids(parent, LINKS[i])
+        _solids(parent, link_parts()[i])
         element(
             actuator,
             "position",
@@ -273,7 +273,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
     turned = (np.cos(HAND_ANGLE / 2), 0.0, 0.0, np.sin(HAND_ANGLE / 2))
     hand = element(parent, "body", name="hand", pos=text(0.0, 0.0, FLANGE), quat=text(*turned), gravcomp="1")
     _inertial(hand, HAND_INERTIA)
-    _solids(hand, HAND)
+    _solids(hand, hand_parts())
     element(hand, "site", name="gripper", pos=text(0.0, 0.0, FINGER_TIPS), group="5")
     for name, quaternion in (("left", (1.0, 0.0, 0.0, 0.0)), ("right", (0.0, 0.0, 0.0, 1.0))):
         finger = element(
@@ -289,7 +289,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
             range=text(0.0, FINGER_TRAVEL),
             armature="0.1",
         )
-        _solids(finger, FINGER)
+        _solids(finger, finger_parts())
         element(
             actuator,
             "position",

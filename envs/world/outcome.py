@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import enum
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
 from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 
 class Failure(enum.IntEnum):
@@ -60,7 +60,7 @@ class Overflow(enum.IntFlag):
     SHAPES = 4
 
 
-class Outcome(flax.struct.PyTreeNode):
+class Outcome(PyTreeNode):
     """Outcome of an action, with any leading axes, for example one for the worlds.
 
     Attributes:

@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.geometry.bodies import bodies_of as of_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.shapes import PRIMITIVES, Shape, in_order, shape_of
 from mechsearch_jax.shapes.compound import (
     COMPOUND,
@@ -50,7 +50,7 @@ MAX_TILT = math.radians(15)
 ROOM = 0.02
 
 
-class Solids(flax.struct.PyTreeNode):
+class Solids(PyTreeNode):
     """The solids of bodies, in the bodies' frames; leading axes (..., 9, 16).
 
     Attributes:
@@ -71,7 +71,7 @@ class Solids(flax.struct.PyTreeNode):
     valid: jax.Array
 
 
-class Matter(flax.struct.PyTreeNode):
+class Matter(PyTreeNode):
     """What bodies are made of; leading axes (..., 9).
 
     Attributes:
@@ -91,7 +91,7 @@ class Matter(flax.struct.PyTreeNode):
     colour: jax.Array
 
 
-class Compounds(flax.struct.PyTreeNode):
+class Compounds(PyTreeNode):
     """What a `World` of compounds knows beside a plain one.
 
     Attributes:
@@ -232,7 +232,7 @@ class CompoundTarget:
     made_of: Compound = dataclasses.field(compare=False)
 
 
-class World(flax.struct.PyTreeNode):
+class World(PyTreeNode):
     """All bodies on the shelf. Arrays have the leading axes (..., 9): eight slots for objects, then the target.
 
     Attributes:
@@ -252,7 +252,7 @@ class World(flax.struct.PyTreeNode):
     rotation: jax.Array
     valid: jax.Array
     compounds: Compounds | None = None
-    target: CompoundTarget | None = flax.struct.field(pytree_node=False, default=None)
+    target: CompoundTarget | None = static(default=None)
 
 
 def slots(scenario: Scenario) -> list[Body | None]:

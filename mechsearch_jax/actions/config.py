@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import math
 
-import flax.struct
 import jax
 import numpy as np
 
@@ -15,7 +14,8 @@ from mechsearch_jax.dynamics.push_model import LEVERAGE
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.options import option
+from mechsearch_jax.runtime.options import in_degrees, option
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Longer pushes would leave the shelf [m].
@@ -67,7 +67,8 @@ class ActionConfig:
     )
     push_directions: tuple[float, ...] = option(
         tuple(math.radians(angle) for angle in (90, -90, 0, 35, -35, 65, -65)),
-        "directions of pushes, from straight into the shelf to the left [rad]; the paper's are 1.571 and -1.571",
+        "directions of pushes, from straight into the shelf to the left [degrees]; the paper's are 90 and -90",
+        least_degrees=4.0,
     )
     push_distances: tuple[float, ...] = option((0.05, 0.10, 0.15), "how far pushes go [m]")
     push_tilt: float = math.radians(30)
@@ -101,7 +102,10 @@ class ActionConfig:
     def _check_pushes(self):
         angles, distances = self.push_directions, self.push_distances
         if not angles or len(set(angles)) < len(angles) or not all(abs(angle) <= math.pi for angle in angles):
-            raise InputError(f"push_directions {angles} must be one or more different angles within {math.pi:.4f} rad")
+            shown = " ".join(f"{angle:.4g}" for angle in in_degrees(angles))
+            raise InputError(
+                f"push_directions {shown} [degrees] must be one or more different angles from -180 to 180 degrees"
+            )
         if not distances or not all(0.0 < d <= LONGEST_PUSH for d in distances):
             raise InputError(
                 f"push_distances {distances} must be one or more lengths above 0 and at most {LONGEST_PUSH} m"
@@ -112,7 +116,7 @@ class ActionConfig:
             raise InputError(f"push_postures {self.push_postures} must be pairs of a yaw and an index in push_wrists")
 
 
-class ActionTables(flax.struct.PyTreeNode):
+class ActionTables(PyTreeNode):
     """Constants of the actions, for W wrist angles; clouds are in the gripper's frame, open (`OPEN`), then closed.
 
     Attributes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +34,7 @@ from mechsearch_jax.robot.robot_trajectory import derivatives
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -50,7 +50,7 @@ class Setting(Protocol):
     def target(self) -> Target: ...
 
 
-class JointTrajectory(flax.struct.PyTreeNode):
+class JointTrajectory(PyTreeNode):
     """The motion of the arm and the fingers, one row for each time step.
 
     It begins and ends outside the shelf. The caller plans the motion between there and the home configuration, in front
@@ -68,7 +68,7 @@ class JointTrajectory(flax.struct.PyTreeNode):
     position: jax.Array
     velocity: jax.Array
     gripper: jax.Array
-    events: tuple[HandEvent, ...] = flax.struct.field(pytree_node=False, default=())
+    events: tuple[HandEvent, ...] = static(default=())
 
 
 class Grasped(NamedTuple):

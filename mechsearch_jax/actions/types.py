@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import flax.struct
 import jax
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 
-class Action(flax.struct.PyTreeNode):
+class Action(PyTreeNode):
     """One action of the robot; every field may carry leading batch axes.
 
     Attributes:
@@ -34,7 +34,7 @@ class Action(flax.struct.PyTreeNode):
     opening: jax.Array
 
 
-class Sample(flax.struct.PyTreeNode):
+class Sample(PyTreeNode):
     """A sampled action.
 
     Attributes:
@@ -64,7 +64,7 @@ class DrawnCandidate(NamedTuple):
     wanted: Bool[Array, ""]
 
 
-class Prediction(flax.struct.PyTreeNode):
+class Prediction(PyTreeNode):
     """Predicted effect of an action.
 
     Attributes:
@@ -78,7 +78,7 @@ class Prediction(flax.struct.PyTreeNode):
     possible: jax.Array
 
 
-class Candidates(flax.struct.PyTreeNode):
+class Candidates(PyTreeNode):
     """Candidate actions of one kind for each object of a scene, among which one is drawn (paper B.5).
 
     Each of N objects has V gripper poses, each with D distances.

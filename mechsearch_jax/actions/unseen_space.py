@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import transform_rows
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Cells of the raster beyond the candidate poses on each side, so that it covers the board: they stay 50 mm from its
 # edges, and are 15 mm apart.
 BORDER = 4
 
 
-class PossibleSpace(flax.struct.PyTreeNode):
+class PossibleSpace(PyTreeNode):
     """The part of the shelf that may be filled by what was not seen, as a raster spaced as the candidate poses are.
 
     Attributes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,11 +25,12 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.render import merge_windows
 from mechsearch_jax.workspace.target_view import body_at, main_body
 
 
-class Belief(flax.struct.PyTreeNode):
+class Belief(PyTreeNode):
     """The belief about the target.
 
     Attributes:

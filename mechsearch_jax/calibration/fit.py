@@ -17,34 +17,138 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.calibration.patches import flat_patches
 from mechsearch_jax.images.camera_pose import with_pose
 from mechsearch_jax.images.cloud import middle
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Pixels that are used: of a whole calibration, and of the check at every look.
-ALL_PIXELS, FEW_PIXELS = 1_000_000, 60_000
-# How far from its place a face is searched [m].
-REACH = 0.12
-# Angles between a patch's normal and its face's within which it may be the face's, from step to step [rad].
-TURNS = tuple(math.radians(angle) for angle in (25.0, 25.0, 15.0, 10.0, 6.0, 4.0, 4.0))
-# Distances of a point from its face within which it counts, from step to step [m].
-REACHES = (0.015, 0.015, 0.015, 0.01, 0.007, 0.005, 0.005, 0.005)
-# Angle between a point's normal and its face's in these steps [rad].
-ALIKE = math.radians(8.0)
-# Bins of the search for a face [m]; the outermost with this share of the most patches is the face.
-BIN, SHARE = 0.004, 0.2
-# A face needs so many patches, over a width, or else a height or depth, that no object has [m].
-FEWEST, WIDTH, LENGTH = 6, 0.18, 0.24
-# Two faces across an axis that contradict each other by more than this are not both fitted [m].
-CONTRADICTION = 0.006
-# A rotation counts as the shift at this distance [m].
-LEVER = 0.25
-# A direction is determined if its standard error is below this [m], with residuals of at least this [m].
-LEAST_PRECISION, LEAST_RESIDUAL = 0.001, 0.0003
+# Side of a block in pixels of the thinned image.
+SIDE = 8
+# Least share of a block's pixels with a depth.
+LEAST_MEASURED = 0.2
+# A pixel counts that is off by at most so many standard deviations of its block, by their median, and this [m]; at
+# least this share of a block's measured pixels must count.
+NEAR, LEAST_NEAR, LEAST_COUNTED = 4.0, 0.0005, 0.75
+# A block is flat if its depth deviates from a plane by at most so many times the median of all blocks, and this [m].
+FLATNESS, LEAST_DEVIATION = 2.0, 0.0005
+
+
+class Patches(NamedTuple):
+    """N flat patches in the camera's frame.
+
+    Attributes:
+      point: the middle of each, on its plane [m].
+      normal: unit vectors towards the camera.
+      pixels: how many of the image's pixels each stands for.
+    """
+
+    point: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    pixels: Float[np.ndarray, " n"]
+
+
+def flat_patches(camera: Camera, depth: Float[np.ndarray, "h w"], most: int) -> Patches:
+    """The flat patches of a depth image.
+
+    Args:
+      camera: of the image.
+      depth: along the camera's axis [m].
+      most: the image is thinned to at most about so many pixels.
+    """
+    stride = max(1, round(math.sqrt(depth.size / most)))
+    thin = np.asarray(depth[::stride, ::stride])
+    rows, columns = (size // SIDE for size in thin.shape)
+    blocks = thin[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE).swapaxes(1, 2)
+    blocks = blocks.reshape(rows * columns, SIDE**2)
+    is_measured = np.isfinite(blocks) & measured(blocks)
+    enough = is_measured.sum(axis=1) >= max(LEAST_MEASURED * SIDE**2, 4)
+    blocks, is_measured = blocks[enough], is_measured[enough]
+    # The middle of each block in the image, at unit depth.
+    place = (np.arange(rows), np.arange(columns))
+    down, across = ((p * SIDE + (SIDE - 1) / 2.0) * stride + 0.5 for p in place)
+    down, across = np.meshgrid((down - camera.cy) / camera.fy, (across - camera.cx) / camera.fx, indexing="ij")
+    middle = np.stack([across.ravel(), down.ravel()], axis=1)[enough]
+    # The pixels of all blocks lie alike around their middles.
+    offset = (np.arange(SIDE) - (SIDE - 1) / 2.0) * stride
+    v, u = np.meshgrid(offset / camera.fy, offset / camera.fx, indexing="ij")
+    basis = np.stack([u.ravel(), v.ravel(), np.ones(SIDE**2)], axis=1)
+    inverse = np.where(is_measured, 1.0 / np.where(is_measured, blocks, 1.0), np.nan)
+    slopes = _plane_of_medians(inverse, v, u)
+    off = np.abs(inverse - slopes @ basis.T) / np.maximum(slopes[:, 2:], 1e-6) ** 2
+    counted = off <= NEAR * 1.4826 * _median(off) + LEAST_NEAR
+    enough = counted.sum(axis=1) >= LEAST_COUNTED * is_measured.sum(axis=1)
+    weight, inverse = counted.astype(float), np.where(counted, inverse, 0.0)
+    products = (basis[:, :, None] * basis[:, None, :]).reshape(SIDE**2, 9)
+    matrix, right = (weight @ products).reshape(-1, 3, 3), inverse @ basis
+    # A block whose pixels lie on a line has no plane.
+    solid = enough & (np.linalg.cond(matrix * np.outer(*[1.0 / np.sqrt(np.diag(basis.T @ basis))] * 2)) < 1e4)
+    slopes = np.zeros_like(right)
+    slopes[solid] = np.linalg.solve(matrix[solid], right[solid][..., None])[..., 0]
+    return _flat(middle, slopes, inverse, weight, basis, solid, stride)
+
+
+def _median(values: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n 1"]:
+    """The lower median of each row's finite values; NaN without any."""
+    middle = np.maximum(np.isfinite(values).sum(axis=1, keepdims=True) - 1, 0) // 2
+    # NaN is sorted last.
+    return np.take_along_axis(np.sort(values, axis=1), middle, axis=1)
+
+
+def _plane_of_medians(
+    inverse: Float[np.ndarray, "n p"], v: Float[np.ndarray, "s s"], u: Float[np.ndarray, "s s"]
+) -> Float[np.ndarray, "n 3"]:
+    """Slopes of blocks' inverse depths along u and v, and those at their middles, by the medians of differences.
+
+    Args:
+      inverse: depth of the pixels, NaN where not measured.
+      v, u: of the pixels at unit depth.
+    """
+    square = inverse.reshape(-1, SIDE, SIDE)
+
+    def slope(along: Float[np.ndarray, "n s s"], at: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n 1"]:
+        # Two distances, for a sensor may measure every second or third row or column only.
+        parts = [(along[:, by:] - along[:, :-by]) / (at[by] - at[0]) for by in (SIDE // 2 - 1, SIDE // 2)]
+        return np.nan_to_num(_median(np.concatenate(parts, axis=1).reshape(len(along), (SIDE + 1) * SIDE)))
+
+    across, down = slope(square.swapaxes(1, 2), u[0]), slope(square, v[:, 0])
+    return np.hstack([across, down, _median(inverse - across * u.ravel() - down * v.ravel())])
+
+
+def _flat(
+    middle: np.ndarray,
+    slopes: np.ndarray,
+    inverse: np.ndarray,
+    weight: np.ndarray,
+    basis: np.ndarray,
+    solid: np.ndarray,
+    stride: int,
+) -> Patches:
+    """The blocks that are flat.
+
+    Args:
+      middle: of each block at unit depth, shape (n, 2).
+      slopes: of its inverse depth, and that at its middle, shape (n, 3).
+      inverse: its pixels' inverse depths, 0 where not measured, shape (n, p).
+      weight: 1 where measured, else 0, shape (n, p).
+      basis: offset of each pixel from the middle at unit depth, and 1, shape (p, 3).
+      solid: which blocks have a plane, shape (n,).
+      stride: thinning of the image.
+    """
+    count = weight.sum(axis=1)
+    centre = weight @ basis[:, :2] / np.maximum(count, 1)[:, None]
+    at_centre = np.sum(slopes[:, :2] * centre, axis=1) + slopes[:, 2]
+    solid = solid & (at_centre > 1e-3)
+    safe = np.where(solid, at_centre, 1.0)
+    residual = weight * (inverse - slopes @ basis.T)
+    deviation = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(count - 3, 1)) / safe**2
+    usual = float(np.median(deviation[solid])) if solid.any() else 0.0
+    flat = solid & (deviation <= FLATNESS * usual + LEAST_DEVIATION)
+    ray = np.concatenate([middle + centre, np.ones((len(middle), 1))], axis=1)
+    normal = np.concatenate([slopes[:, :2], (slopes[:, 2] - np.sum(slopes[:, :2] * middle, axis=1))[:, None]], axis=1)
+    # It points away from the camera, for its product with a point is 1.
+    normal = -normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return Patches((ray / safe[:, None])[flat], normal[flat], stride**2 * count[flat])
 
 
 class Face(NamedTuple):
@@ -88,6 +192,28 @@ FACES = (
     Face("left side wall", "left", 1, -1.0),
     Face("upper board", "ceiling", 2, -1.0),
 )
+
+
+# Pixels that are used: of a whole calibration, and of the check at every look.
+ALL_PIXELS, FEW_PIXELS = 1_000_000, 60_000
+# How far from its place a face is searched [m].
+REACH = 0.12
+# Angles between a patch's normal and its face's within which it may be the face's, from step to step [rad].
+TURNS = tuple(math.radians(angle) for angle in (25.0, 25.0, 15.0, 10.0, 6.0, 4.0, 4.0))
+# Distances of a point from its face within which it counts, from step to step [m].
+REACHES = (0.015, 0.015, 0.015, 0.01, 0.007, 0.005, 0.005, 0.005)
+# Angle between a point's normal and its face's in these steps [rad].
+ALIKE = math.radians(8.0)
+# Bins of the search for a face [m]; the outermost with this share of the most patches is the face.
+BIN, SHARE = 0.004, 0.2
+# A face needs so many patches, over a width, or else a height or depth, that no object has [m].
+FEWEST, WIDTH, LENGTH = 6, 0.18, 0.24
+# Two faces across an axis that contradict each other by more than this are not both fitted [m].
+CONTRADICTION = 0.006
+# A rotation counts as the shift at this distance [m].
+LEVER = 0.25
+# A direction is determined if its standard error is below this [m], with residuals of at least this [m].
+LEAST_PRECISION, LEAST_RESIDUAL = 0.001, 0.0003
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +265,7 @@ class ShelfFit:
     def corrected(self) -> Camera:
         """The camera where the image says that it is."""
         T = np.eye(4)
-        turn = Rotation.from_rotvec(self.turn).as_matrix()
+        turn = _matrix(self.turn)
         T[:3, :3] = turn @ np.array(self.camera.rotation)
         T[:3, 3] = turn @ (np.array(self.camera.position) - self.pivot) + self.pivot + self.shift
         return with_pose(self.camera, T)
@@ -207,7 +333,7 @@ class _Fit:
             camera,
             self.pivot,
             self.shift,
-            Rotation.from_matrix(self.turn).as_rotvec(),
+            _vector(self.turn),
             scale @ covariance @ scale,
             free,
             tuple(self._seen(face) for face in FACES),
@@ -235,7 +361,7 @@ class _Fit:
         # One face alone leaves the rotation about its normal free, but for noise in the normals.
         kept = values > 0.02
         step = vectors[:, kept] @ ((vectors[:, kept].T @ pull) / values[kept])
-        turn = Rotation.from_rotvec(step).as_matrix()
+        turn = _matrix(step)
         self.turn = turn @ self.turn
         # About the camera, which is turned about itself more often than the shelf is about its middle.
         self.shift = turn @ (self.pivot + self.shift - self.place) + self.place - self.pivot
@@ -311,15 +437,15 @@ class _Fit:
         kept = np.maximum(residual, LEAST_RESIDUAL) < LEAST_PRECISION * np.sqrt(np.maximum(values, 0.0))
         inside, values = vectors[:, kept], values[kept]
         step = inside @ (inside.T @ pull / values)
-        self.turn = Rotation.from_rotvec(step[3:] / LEVER).as_matrix() @ self.turn
+        self.turn = _matrix(step[3:] / LEVER) @ self.turn
         self.shift = self.shift + step[:3]
         return residual**2 * (inside / values) @ inside.T, vectors[:, ~kept]
 
     def _give_back(self, free: np.ndarray) -> None:
         """Take the part of the motion back that lies in directions of (shift, `LEVER` * turn), as columns."""
-        motion = np.concatenate([self.shift, LEVER * Rotation.from_matrix(self.turn).as_rotvec()])
+        motion = np.concatenate([self.shift, LEVER * _vector(self.turn)])
         motion -= free @ (free.T @ motion)
-        self.shift, self.turn = motion[:3], Rotation.from_rotvec(motion[3:] / LEVER).as_matrix()
+        self.shift, self.turn = motion[:3], _matrix(motion[3:] / LEVER)
 
     def _seen(self, face: Face) -> FaceFit:
         place = self._outermost(face)
@@ -329,3 +455,17 @@ class _Fit:
         on = self._candidates(face, points, normals, 0.01)
         on &= np.abs(face.height(self.shelf, points) - place[0]) < REACHES[-1]
         return FaceFit(face, int(on.sum()), int(self.pixels[on].sum()), place[0])
+
+
+def _matrix(turn: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation by a rotation vector [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(turn).as_matrix()
+
+
+def _vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+    """The rotation vector [rad] of a rotation."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()

@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.options import angle
 
 # Largest limits [m], [rad].
 FARTHEST, STEEPEST = 1.0, math.pi
@@ -24,9 +25,9 @@ class CalibrationLimits:
     """
 
     warn_shift: float = 0.003
-    warn_turn: float = 0.007
+    warn_turn: float = angle(math.radians(0.4), least_degrees=0.05)
     refuse_shift: float = 0.01
-    refuse_turn: float = 0.0262
+    refuse_turn: float = angle(math.radians(1.5), least_degrees=0.05)
 
     def __post_init__(self):
         for name, most, unit in (("shift", FARTHEST, "m"), ("turn", STEEPEST, "rad")):

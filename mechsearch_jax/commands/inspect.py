@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mechsearch_jax.commands.options import DEFAULTS, EpisodeOptions, Scenarios, find_scenarios
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import check_once
 
 
 def inspect(
@@ -32,18 +32,15 @@ def inspect(
     from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.maps import save_maps
-    from mechsearch_jax.workspace.scenario import Scenario, load_scenario
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     options.only_native("inspect")
     options.without_mismatch("inspect")
     (method,) = options.methods(("search-for-grasp",))
     workcell = method.workcell
-    scenes: dict[str, Scenario] = {}
-    for file in find_scenarios(scenarios):
-        scene = load_scenario(file, workcell.shelf)
-        if scene.name in scenes:
-            raise InputError(f"{file}: another scenario is called {scene.name}, too, as its maps would be; rename one")
-        scenes[scene.name] = scene
+    loaded = [load_scenario(file, workcell.shelf) for file in find_scenarios(scenarios)]
+    check_once("inspect: two scenes, and their maps,", (scene.name for scene in loaded))
+    scenes = {scene.name: scene for scene in loaded}
     check_writable(out)
     keep_compilations()
     targets = {name: target_of(scene, workcell.target) for name, scene in scenes.items()}

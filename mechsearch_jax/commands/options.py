@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
+from mechsearch_jax.commands.world import about_world, mismatch_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import check_writable, is_file, is_folder
 
@@ -38,11 +39,13 @@ class EpisodeOptions:
         target's too; the others see noisy depth, "masks" with true segments; "-parts": bodies of up to four parts.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
+      world: how the simulated world differs from what the planner assumes.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
+    world: tuple[str, ...] = ()
 
     def settings(self) -> Settings:
         """The configuration file's settings, overridden by the options that are given.
@@ -52,8 +55,8 @@ class EpisodeOptions:
         """
         from mechsearch_jax.planner import OPTIONS
 
-        named = {option.name: getattr(self, option.name, None) for option in OPTIONS}
-        given = {name: value for name, value in named.items() if value is not None}
+        named = {option: getattr(self, option.name, None) for option in OPTIONS}
+        given = {option.name: option.inside(value) for option, value in named.items() if value is not None}
         return settings_of(self.config_file).with_options(getattr(self, "preset", None), **given)
 
     def mismatch(self) -> Mismatch:
@@ -62,10 +65,7 @@ class EpisodeOptions:
         Raises:
           InputError: an option is impossible.
         """
-        from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS, Mismatch
-
-        named = {option.path[0]: getattr(self, option.name, None) for option in MISMATCH_OPTIONS}
-        return Mismatch(**{name: value for name, value in named.items() if value is not None})
+        return mismatch_of(self.world)
 
     def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
         """The method of each policy.
@@ -126,8 +126,8 @@ class EpisodeOptions:
         Raises:
           InputError: an option of it is given.
         """
-        if self.mismatch() != type(self.mismatch())():
-            raise InputError(f"{command}: simulates no world that could differ; leave --world-... and the like out")
+        if self.world:
+            raise InputError(f"{command}: simulates no world that could differ; leave --world out")
 
 
 # Default of a command's parameter `options`, before `with_planner_options` adds the planner's.
@@ -136,11 +136,10 @@ DEFAULTS = EpisodeOptions()
 
 @functools.cache
 def with_planner_options() -> type[EpisodeOptions]:
-    """`EpisodeOptions` with a field for the preset and for each option of planner and mismatch, None if not given.
+    """`EpisodeOptions` with a field for the preset and for each option of the planner, None if not given.
 
     Importing the configuration, which defines them, takes a second.
     """
-    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS, Mismatch
     from mechsearch_jax.planner import DEFAULT_PRESET, OPTIONS, PRESETS
 
     preset = tyro.conf.arg(
@@ -150,9 +149,7 @@ def with_planner_options() -> type[EpisodeOptions]:
     )
     fields: list[tuple[str, Any, Any]] = [("preset", Annotated[Literal[tuple(PRESETS)] | None, preset], None)]
     fields += [(option.name, _annotation(option, _usual(option)), None) for option in OPTIONS]
-    for option in MISMATCH_OPTIONS:
-        hint = f"(default: {getattr(Mismatch(), option.path[0])})"
-        fields.append((option.name, _annotation(option, hint), None))
+    fields.append(("world", world_argument(), ()))
     return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
 
 
@@ -161,24 +158,22 @@ BOXES = {
     "search": "Where settings come from, and how a search is run.",
     "recognition": "What the planner sees the objects through.",
     "planner": "How the next action is chosen.",
-    "world": "How the simulated world differs from what the planner assumes.",
+    "world": "What the simulated world is like.",
 }
-_SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "rehearsal", "max_steps")
-_RECOGNITION = (
-    *("recognition", "depth_noise", "missing_depth", "holes"),
-    *("color_noise", "exposure", "white_balance", "hue_gap"),
-)
+_SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "trials", "max_steps")
 
 
 def _box(name: str) -> str:
     """The box of an option."""
-    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
+    if name in ("recognition", "world"):
+        return name
+    return "search" if name in _SEARCH else "planner"
 
-    if name in _RECOGNITION:
-        return "recognition"
-    if name in _SEARCH:
-        return "search"
-    return "world" if name in {option.name for option in MISMATCH_OPTIONS} else "planner"
+
+def world_argument(values: str = "VALUE") -> Any:
+    """The type of `--world`, whose help names every key."""
+    about = tyro.conf.arg(metavar=f"KEY={values} ...", help=about_world(), help_behavior_hint="")
+    return Annotated[tuple[str, ...], about]
 
 
 @functools.cache
@@ -218,8 +213,11 @@ def _usual(option: Option) -> str:
     """The hint for an option's default: the default preset's value, and other presets' where they differ."""
     from mechsearch_jax.planner import DEFAULT_PRESET, PRESETS
 
-    values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
-    shown = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
+    values = {name: option.outside(preset().options()[option.name]) for name, preset in PRESETS.items()}
+    shown = {
+        name: " ".join(map(_short, value)) if isinstance(value, list | tuple) else value
+        for name, value in values.items()
+    }
     usual = shown.pop(DEFAULT_PRESET)
     presets_by_value: dict[Any, list[str]] = {}
     for name, value in shown.items():
@@ -230,7 +228,7 @@ def _usual(option: Option) -> str:
 
 
 def _short(value: Any) -> str:
-    return str(round(value, 4) if isinstance(value, float) else value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 _METAVARS: dict[Any, str] = {

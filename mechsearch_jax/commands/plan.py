@@ -30,7 +30,7 @@ class ImageFiles:
 
     Attributes:
       depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
-      color: colour image, registered to the depth image; the target is seen by its colour.
+      colour: colour image, registered to the depth image; the target is seen by its colour.
       mask: image of whole numbers, one for each object, registered to the depth image; without it the segmentation
         network tells the objects apart.
       background: the number in the mask that stands for no object.
@@ -40,7 +40,7 @@ class ImageFiles:
     """
 
     depth: ImageFile = None
-    color: ImageFile = None
+    colour: ImageFile = None
     mask: ImageFile = None
     background: int = BACKGROUND
     target_id: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
@@ -55,9 +55,9 @@ class ImageFiles:
         """
         if self.example == (self.depth is not None):
             raise InputError("plan: give either --depth IMAGE or --example, not both")
-        if self.example and not self.color is self.mask is self.camera is None:
+        if self.example and not self.colour is self.mask is self.camera is None:
             raise InputError(
-                "plan: --example has images and a camera of its own; leave --color, --mask and --camera out"
+                "plan: --example has images and a camera of its own; leave --colour, --mask and --camera out"
             )
         if self.target_id is not None and self.mask is None:
             raise InputError("plan: --target-id names a number of a mask; give --mask, too")
@@ -74,8 +74,8 @@ class ImageFiles:
         assert self.depth is not None
         images: dict[str, Any] = {"depth": image_files.load_depth(self.depth)}
         warnings = ()
-        if self.color is not None:
-            images["colour"] = image_files.load_colour(self.color)
+        if self.colour is not None:
+            images["colour"] = image_files.load_colour(self.colour)
         if self.mask is not None:
             images["mask"], numbers = image_files.load_mask(self.mask, self.background)
             if self.target_id is not None:
@@ -87,7 +87,7 @@ class ImageFiles:
                         "not seen; give the number that the mask has for it, or a negative one where it does not show "
                         "it",
                     )
-            elif self.color is None and len(numbers) == INSTANCES:
+            elif self.colour is None and len(numbers) == INSTANCES:
                 raise InputError(
                     f"{self.mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one "
                     "out"
@@ -180,7 +180,7 @@ def _example(out: Path) -> tuple[dict[str, Any], Camera]:
 
     images = example_images()
     image_files.save_depth(images.depth, out / "depth.png")
-    image_files.save_colour(images.colour, out / "color.png")
+    image_files.save_colour(images.colour, out / "colour.png")
     image_files.save_mask(images.mask, out / "mask.png", BACKGROUND)
     image_files.save_camera(images.camera, out / "camera.json")
     return {"depth": images.depth, "colour": images.colour}, images.camera

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     from mechsearch_jax.benchmarks.paper.paper_tables import PaperTable
     from mechsearch_jax.benchmarks.paper.reproduce import Setting
-    from mechsearch_jax.benchmarks.running.evaluate import Job
-    from mechsearch_jax.benchmarks.running.planned import PlannedJob
+    from mechsearch_jax.benchmarks.running.evaluate import Job, PlannedJob
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.scenes.scene_sets import Block
     from mechsearch_jax.envs.simulators.named import EngineName
@@ -151,7 +150,7 @@ def _planned(
     methods: Mapping[Setting, Method], scenes: Sequence[tuple[Block, int]], seeds: Sequence[int]
 ) -> list[PlannedJob]:
     """The episodes of all settings, of scenes that are not made."""
-    from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+    from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, planned_jobs
 
     outlines = [SceneOutline.of_block(*scene) for scene in scenes]
     return planned_jobs(outlines, list(methods.values()), seeds)

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.report.console_tables import EpisodeProgress
-    from mechsearch_jax.benchmarks.running.evaluate import Job, Runner
-    from mechsearch_jax.benchmarks.running.planned import PlannedJob, SceneOutline
+    from mechsearch_jax.benchmarks.running.evaluate import Job, PlannedJob, Runner, SceneOutline
     from mechsearch_jax.benchmarks.store.rows import EpisodeRow
     from mechsearch_jax.envs.simulators.named import EngineName
 
@@ -249,7 +248,7 @@ def run_episodes_of(
     methods = list(dict.fromkeys(method for point in points for method in point.methods(policies, engine)))
     seeds = list(dict.fromkeys(seeds))
     if run.dry_run:
-        from mechsearch_jax.benchmarks.running.planned import planned_jobs
+        from mechsearch_jax.benchmarks.running.evaluate import planned_jobs
 
         planned = planned_jobs(outlines_of(scenarios), methods, seeds)
         print_estimate(command, planned, out, run, points[0].simulator)
@@ -265,7 +264,7 @@ def outlines_of(names: Sequence[str]) -> list[SceneOutline]:
     Raises:
       InputError: there is no scenario for a name.
     """
-    from mechsearch_jax.benchmarks.running.planned import SceneOutline
+    from mechsearch_jax.benchmarks.running.evaluate import SceneOutline
     from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, set_scenes
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 

@@ -17,13 +17,16 @@ from mechsearch_jax.commands.options import (
     SomeScenarios,
     chosen_policies,
     with_planner_options,
+    world_argument,
 )
 from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_episodes_of
+from mechsearch_jax.commands.world import swept
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, nearest
+from mechsearch_jax.runtime.tables import checked, read_document
 
 if TYPE_CHECKING:
-    from mechsearch_jax.planner import Option
+    from mechsearch_jax.runtime.tables import Document
 
 Recognition = Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"]
 SimulatorName = Literal["auto", "native", "mjx"]
@@ -37,6 +40,8 @@ _KEYS: Mapping[str, Any] = {
 }
 _SINGLE = ("simulator", "config")
 # Keys that are fields of `SweptOptions`, and the names of the fields.
+# The key and the table of `--world`.
+_WORLD = "world"
 _FIELDS = {"recognition": "recognition", "simulator": "simulator", "config": "config_file"}
 
 
@@ -51,6 +56,7 @@ class SweptOptions:
         depth image, "masks" with the true segmentation, "full" without.
       simulator: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for batches where there is a GPU.
         One for all.
+      world: how the simulated world differs from what the planner assumes, with commas between several values.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
@@ -61,6 +67,7 @@ class SweptOptions:
     simulator: Annotated[
         SimulatorName | None, tyro.conf.arg(metavar="{auto,native,mjx}", help_behavior_hint="(default: auto)")
     ] = None
+    world: tuple[str, ...] = ()
 
     def points(self) -> list[EpisodeOptions]:
         """All combinations of the values, in the order of the options.
@@ -72,12 +79,14 @@ class SweptOptions:
 
         kind: Any = with_planner_options()
         lists = {option.name: option.type for option in OPTIONS if get_origin(option.type) is tuple}
-        swept = {"recognition": self.recognition, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
-        given = {
+        values_of = {"recognition": self.recognition}
+        values_of |= {name: getattr(self, name, ()) for name in ("preset", *(option.name for option in OPTIONS))}
+        given: dict[str, list[Any]] = {
             name: [_listed(name, value, lists[name]) if name in lists else value for value in values]
-            for name, values in swept.items()
+            for name, values in values_of.items()
             if values
         }
+        given["world"] = list(itertools.product(*swept(self.world).values()))
         file = None if self.config_file is None else Path(self.config_file)
         fixed: dict[str, Any] = {"config_file": file, "simulator": self.simulator or "auto"}
         return [kind(**fixed, **dict(zip(given, point, strict=True))) for point in itertools.product(*given.values())]
@@ -92,7 +101,7 @@ class SweptPolicies:
 
     Attributes:
       file: a file with scenarios, policy, seed and options by their names with underscores, a value or a list of values
-        each; what is given here goes before it.
+        each, and perhaps a table [world]; what is given here goes before it.
       method: one or more; search-for-grasp if neither this nor a policy is given.
       policy: instead of methods, names of policies, or import paths of others, one or more.
       seed: one or more; 0 if not given.
@@ -117,14 +126,6 @@ class SweptPolicies:
 SWEPT_POLICIES = SweptPolicies()
 
 
-def _options() -> dict[str, Option]:
-    """The options of planner and mismatch by their names."""
-    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
-    from mechsearch_jax.planner import OPTIONS
-
-    return {option.name: option for option in (*OPTIONS, *MISMATCH_OPTIONS)}
-
-
 def _listed(name: str, value: Any, kind: Any) -> tuple[Any, ...]:
     """The parts of a value that is itself a list; separated by commas on the command line."""
     if not isinstance(value, str):
@@ -140,8 +141,8 @@ def _listed(name: str, value: Any, kind: Any) -> tuple[Any, ...]:
 
 @functools.cache
 def with_swept_options() -> type[SweptOptions]:
-    """`SweptOptions` with a field for the preset and for each option of planner and mismatch, empty if not given."""
-    from mechsearch_jax.planner import PRESETS
+    """`SweptOptions` with a field for the preset and for each option of the planner, empty if not given."""
+    from mechsearch_jax.planner import OPTIONS, PRESETS
 
     def several(kind: Any, metavar: str, about: str) -> Any:
         shown = tyro.conf.arg(metavar=f"{metavar} ...", help=about, help_behavior_hint="")
@@ -150,7 +151,7 @@ def with_swept_options() -> type[SweptOptions]:
     names = ",".join(PRESETS)
     preset = several(Literal[tuple(PRESETS)], f"{{{names}}}", "where settings come from that are not given.")
     fields: list[tuple[str, Any, Any]] = [("preset", preset, ())]
-    for option in _options().values():
+    for option in OPTIONS:
         if get_origin(option.type) is tuple:
             part = "NAME" if get_args(option.type)[0] is str else "FLOAT"
             kind, metavar = str, f"{part},..."
@@ -159,41 +160,52 @@ def with_swept_options() -> type[SweptOptions]:
         else:
             kind, metavar = option.type, "{True,False}" if option.type is bool else str(option.type.__name__).upper()
         fields.append((option.name, several(kind, metavar, f"{option.help}."), ()))
+    fields.append(("world", world_argument("VALUE,..."), ()))
     return dataclasses.make_dataclass("Swept", fields, bases=(SweptOptions,), frozen=True, kw_only=True)
 
 
 def read_sweep(path: Path) -> dict[str, Any]:
     """Read the values of a sweep's file by key: tuples, except for keys with a single value for all episodes.
 
+    Those of its table `world` are texts as on the command line.
+
     Raises:
       InputError: the file cannot be read, a key is unknown, or a value is of another type. The message names file, line
         and key.
     """
-    from mechsearch_jax.planner import PRESETS
-    from mechsearch_jax.runtime.tables import checked, read_document
+    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
+    from mechsearch_jax.planner import OPTIONS, PRESETS
 
     document = read_document(path)
     for table in document.tables:
-        if table:
+        if table not in ("", _WORLD):
             raise InputError(
-                f"{document.where(table)} is a table, of which a sweep has none; give its settings by config"
+                f"{document.where(table)} is a table, of which a sweep has [world] alone; give its settings by config"
             )
-    types = {name: Literal[option.choices] if option.choices else option.type for name, option in _options().items()}
-    key_types = {**_KEYS, "preset": Literal[tuple(PRESETS)], **types}
+    options = {option.name: option.values for option in OPTIONS}
+    values_of = _values(document, "", {**_KEYS, "preset": Literal[tuple(PRESETS)], **options})
+    world = _values(document, _WORLD, {name: option.values for name, option in MISMATCH_OPTIONS.items()})
+    if world:
+        values_of[_WORLD] = tuple(f"{key}={','.join(map(str, values))}" for key, values in world.items())
+    return values_of
+
+
+def _values(document: Document, table: str, types: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a table's keys, of these types: tuples of them, but for keys with a single value for all."""
     values_of: dict[str, Any] = {}
-    for key, value in document.tables[""].items():
-        where = document.where("", key)
-        if key not in key_types:
+    for key, value in document.tables.get(table, {}).items():
+        where = document.where(table, key)
+        if key not in types:
             fixed = refusal(key)
-            raise InputError(f"{where}: {fixed}" if fixed else f"{where} is unknown; {nearest(key, key_types)}")
+            raise InputError(f"{where}: {fixed}" if fixed else f"{where} is unknown; {nearest(key, types)}")
         if key in _SINGLE:
-            values_of[key] = checked(value, key_types[key], where)
+            values_of[key] = checked(value, types[key], where)
             continue
-        is_list = get_origin(key_types[key]) is tuple
+        is_list = get_origin(types[key]) is tuple
         several = isinstance(value, list) and (not is_list or any(isinstance(part, list) for part in value))
         values = value if several else [value]
         values_of[key] = tuple(
-            checked(v, key_types[key], f"{where}[{i}]" if several else where) for i, v in enumerate(values)
+            checked(v, types[key], f"{where}[{i}]" if several else where) for i, v in enumerate(values)
         )
     return values_of
 
@@ -223,6 +235,9 @@ def sweep(
     names = chosen_policies("sweep", values.get("method"), values.get("policy"))
     fields = {name: values[key] for key, name in _FIELDS.items() if key in values}
     fields |= {key: value for key, value in values.items() if key not in _KEYS}
+    given = swept(options.world)
+    fields[_WORLD] = *(text for text in fields.get(_WORLD, ()) if text.partition("=")[0] not in given), *options.world
+    options = dataclasses.replace(options, world=())
     not_on_command_line = {key: value for key, value in fields.items() if not getattr(options, key)}
     points = dataclasses.replace(options, **not_on_command_line).points()
     chosen = scenarios or values.get("scenarios", ())

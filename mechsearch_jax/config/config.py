@@ -20,9 +20,9 @@ from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.options import option
+from mechsearch_jax.runtime.options import DEGREES, in_degrees, in_radians, option
 
-RehearsalName = Literal["none", "physics", "learning"]
+TrialsName = Literal["none", "physics", "learning"]
 
 
 class Weights(NamedTuple):
@@ -143,7 +143,7 @@ class Config:
       problem: how the problem is built.
       planner: how the planner decides.
       push_model: name of a push model; see `dynamics.named`, and `envs.pushing.push_models` for "physics".
-      rehearsal: name of what tries actions before one is executed; see `envs.trials`. The paper tries nothing.
+      trials: name of what tries actions before one is executed; see `envs.trials`. The paper tries nothing.
       max_steps: T, actions in an episode.
     """
 
@@ -154,17 +154,17 @@ class Config:
         "what predicts pushes: a network, geometry, or simulating them, on a CPU only those that come first",
         get_args(PushModelName),
     )
-    rehearsal: RehearsalName = option(
+    trials: TrialsName = option(
         "physics",
         "what tries the best few actions out before one is made: nothing, a simulation, one that learns the friction",
-        get_args(RehearsalName),
+        get_args(TrialsName),
     )
     max_steps: int = option(10, "actions in an episode")
 
     def __post_init__(self):
         check_name(self.push_model)
-        if self.rehearsal not in get_args(RehearsalName):
-            raise InputError(f'rehearsal "{self.rehearsal}" is unknown; use {", ".join(get_args(RehearsalName))}')
+        if self.trials not in get_args(TrialsName):
+            raise InputError(f'trials "{self.trials}" is unknown; use {", ".join(get_args(TrialsName))}')
         if self.max_steps < 1:
             raise InputError(f"max_steps {self.max_steps} must be at least 1")
 
@@ -198,6 +198,7 @@ class Option:
       type: of a value.
       help: one line.
       choices: the values it may have; any if None.
+      least_degrees: as of `runtime.options.option`.
     """
 
     name: str
@@ -205,6 +206,31 @@ class Option:
     type: Any
     help: str
     choices: tuple[str, ...] | None
+    least_degrees: float | None = None
+
+    @classmethod
+    def of_field(cls, field: dataclasses.Field[Any], kind: Any, path: tuple[str, ...] = ()) -> Option:
+        """The option of a field that `runtime.options.option` made, of a type, at a path."""
+        about = field.metadata
+        kind = str if about["choices"] else kind
+        return cls(field.name, (*path, field.name), kind, about["help"], about["choices"], about[DEGREES])
+
+    @property
+    def values(self) -> Any:
+        """The type of its values, which are among `choices` if it has some."""
+        return Literal[self.choices] if self.choices else self.type
+
+    def inside(self, given: Any) -> Any:
+        """A value of a file or the command line as the field holds it: angles in radians.
+
+        Raises:
+          InputError: an angle was meant in radians.
+        """
+        return in_radians(self.name, given, self.least_degrees)
+
+    def outside(self, value: Any) -> Any:
+        """A field's value as files and the command line have it: angles in degrees."""
+        return value if self.least_degrees is None else in_degrees(value)
 
 
 def _at(value: Any, path: tuple[str, ...]) -> Any:
@@ -222,13 +248,7 @@ def _fields(kind: type, path: tuple[str, ...]) -> tuple[Option, ...]:
     """The options among the fields of a configuration class, in their order."""
     hints = get_type_hints(kind)
     return tuple(
-        Option(
-            field.name,
-            (*path, field.name),
-            str if field.metadata["choices"] else hints[field.name],
-            field.metadata["help"],
-            field.metadata["choices"],
-        )
+        Option.of_field(field, hints[field.name], path)
         for field in dataclasses.fields(kind)
         if "help" in field.metadata
     )

@@ -1,4 +1,4 @@
-"""Options that this version has no more, and the values that they are fixed at."""
+"""Options that this version has no more: the values that they are fixed at, or what they are called now."""
 
 from __future__ import annotations
 
@@ -52,18 +52,47 @@ FIXED: Mapping[str, Fixed] = {
 }
 
 
+# Keys of `--world` that were options of their own, some of them with `world_` before it.
+_OF_WORLD = frozenset(
+    (
+        *("friction", "mass", "friction_spread", "mass_spread", "size_spread", "physics", "arm_stop"),
+        *("camera_shift", "camera_turn", "shelf_shift", "shelf_turn", "depth_noise", "missing_depth", "holes"),
+        *("colour_noise", "exposure", "white_balance", "hue_gap"),
+    )
+)
+# What options are called now, by the names that files and rows of earlier versions have.
+RENAMED: Mapping[str, str] = {
+    "rehearsal": "trials",
+    "color_noise": "colour_noise",
+    "color": "colour",
+    "colors": "colours",
+}
+
+
 def refusal(name: str) -> str | None:
-    """What to say to who gives an option that is fixed now, in one line; None if the name is of no such option.
+    """What to say to who gives an option that is fixed or has another name now, in one line; None if it is neither.
 
     Args:
       name: with underscores, or as on the command line.
     """
     given = name.partition("=")[0]
-    fixed = FIXED.get(given.removeprefix("--").replace("-", "_"))
+    plain = given.removeprefix("--").replace("-", "_")
+    new = RENAMED.get(plain, plain)
+    if (key := new.removeprefix("world_")) in _OF_WORLD:
+        return f"{given} is a key of {'--world' if given.startswith('--') else '[world]'} now: {key}"
+    if new != plain:
+        return f"{given} is called {'--' + new.replace('_', '-') if given.startswith('--') else new} now"
+    fixed = FIXED.get(plain)
     if fixed is None:
         return None
     paper = "" if fixed.in_paper == fixed.value else f" (in preset paper at {_text(fixed.in_paper)})"
     return f"{given} is no option any more: it is fixed at {_text(fixed.value)}{paper}; leave it out"
+
+
+def renamed(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a row or an episode of an earlier version, by the names that this version has."""
+    prefixed = {f"mismatch.{former}": f"mismatch.{new}" for former, new in RENAMED.items()}
+    return {{**RENAMED, **prefixed}.get(name, name): value for name, value in options.items()}
 
 
 def without_fixed(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,6 +100,7 @@ def without_fixed(options: Mapping[str, Any]) -> dict[str, Any]:
 
     What is fixed now is left out where it had the value that it has in a preset, and `AS_IN_PAPER` says in which.
     """
+    options = renamed(options)
     former = {name: value for name, value in options.items() if name in FIXED}
     rest = {name: value for name, value in options.items() if name not in FIXED}
     if not former:

@@ -48,7 +48,7 @@ def paper(**changes: Any) -> Config:
         "push_distances": (0.05, 0.10, 0.15),
         "actions": ("push", "pick-and-place"),
         "move_target": False,
-        "rehearsal": "none",
+        "trials": "none",
         "horizon": 3,
         "sequences": 30,
     }

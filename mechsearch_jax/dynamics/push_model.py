@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import flax.struct
 import jax
 from jaxtyping import Array
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Largest height of a push's contact, in half widths of the object along the push, for boxes and for round objects.
@@ -17,7 +17,7 @@ LEVERAGE = (1.8, 1.5)
 LOW_CONTACT = 0.03
 
 
-class PushOutcome(flax.struct.PyTreeNode):
+class PushOutcome(PyTreeNode):
     """The predicted outcome of a push.
 
     Attributes:

@@ -12,11 +12,9 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int, Integer, UInt8
 
 from mechsearch_jax.geometry import superquadric
@@ -25,6 +23,7 @@ from mechsearch_jax.geometry.collision_kernel import collide, uses_kernel
 from mechsearch_jax.geometry.masked import block_size, entry_of, for_each, merged, put, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, matmul
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 
 # Pairs that a CPU tests together: by boxes, by bounds, and by gauges.
 BOXES, CLOUDS, GAUGES = 1024, 128, 32
@@ -35,10 +34,10 @@ ABSENT = np.array([1, 0, 0, 1e3, 0, 1, 0, 1e3, 0, 0, 1, 1e3, 1e-3, 1e-3, 1e-3, 1
 # With at most so many pairs, bounds do not pay: gauges decide at once.
 FEW = 1024
 # State of a pair: apart, undecided, or colliding.
-APART, OPEN, HIT = jnp.uint8(0), jnp.uint8(1), jnp.uint8(2)
+APART, OPEN, HIT = np.uint8(0), np.uint8(1), np.uint8(2)
 
 
-class Clouds(flax.struct.PyTreeNode):
+class Clouds(PyTreeNode):
     """Point clouds, each in its own frame.
 
     Attributes:
@@ -53,7 +52,7 @@ class Clouds(flax.struct.PyTreeNode):
     low: jax.Array
     high: jax.Array
     gap: jax.Array | float = 0.0
-    first: int = flax.struct.field(pytree_node=False, default=0)
+    first: int = static(default=0)
 
 
 def clouds_of(points: Float[Array, "c 3 p"]) -> Clouds:
@@ -63,7 +62,9 @@ def clouds_of(points: Float[Array, "c 3 p"]) -> Clouds:
 
 def gap_of(points: Float[np.ndarray, "p 3"], first: int) -> float:
     """`Clouds.gap` of a cloud: how far a point is at most from the nearest of the first ones [m]."""
-    return float(scipy.spatial.KDTree(points[:first]).query(points)[0].max()) if len(points) > first else 0.0
+    from scipy.spatial import KDTree
+
+    return float(KDTree(points[:first]).query(points)[0].max()) if len(points) > first else 0.0
 
 
 def collisions(

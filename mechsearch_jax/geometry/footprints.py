@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 QUARTER_TURN = math.pi / 2
 
@@ -22,7 +22,7 @@ Numbers = Array | np.ndarray
 TOUCH = 0.004
 
 
-class Footprints(flax.struct.PyTreeNode):
+class Footprints(PyTreeNode):
     """Objects seen from above: a rectangle or an ellipse and a range of heights, every field with leading axis N.
 
     Attributes:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from jaxtyping import Array, Float
 from mechsearch_jax.geometry.transforms import align, inverse, make, transform
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Exponent of the sharpest edges that the paper plans with.
 EDGE_EXPONENT = 0.2
@@ -30,7 +30,7 @@ ROUND_EXPONENT = 0.6
 SQUARE = 1.2
 
 
-class Superquadrics(flax.struct.PyTreeNode):
+class Superquadrics(PyTreeNode):
     """N superquadrics, of which any may be absent; every field has the leading axes `(..., N)`.
 
     With `parts` they are N rigid bodies, each the union of its parts; `bodies` has the functions for both cases.

@@ -5,15 +5,17 @@ from __future__ import annotations
 import functools
 import hashlib
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from mechsearch_jax.geometry import spreading
 from mechsearch_jax.geometry.spreading import farthest_points
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
+
+if TYPE_CHECKING:
+    import trimesh
 
 Kind = Literal["box", "capsule"]
 # A box or a capsule: its kind, its size [m] and the bytes of its pose, as of a `gripper.RobotPart`.
@@ -32,6 +34,8 @@ def cloud_of(
       distance: length of the way along z, which ends where the solids are [m].
       seed: equal seeds give equal points.
     """
+    import trimesh
+
     files = (Path(__file__), Path(spreading.__file__))
     source = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     key = repr((solids, front, fine, count, distance, seed, source, trimesh.__version__, np.__version__))
@@ -42,6 +46,8 @@ def cloud_of(
 def _cloud(
     solids: tuple[SolidKey, ...], front: float, fine: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
+    import trimesh
+
     hulls = [_swept_hull(*solid, distance) for solid in solids]
     areas = np.array([hull.mesh.area for hull in hulls])
     shares = np.ceil(12 * count * areas / areas.sum()).astype(int) + 50
@@ -57,6 +63,8 @@ def _cloud(
 
 def mesh_of(kind: Kind, size: tuple[float, ...], pose: np.ndarray) -> trimesh.Trimesh:
     """A primitive's surface; a capsule's facets lie at most half a percent of its radius beneath it."""
+    import trimesh
+
     if kind == "box":
         mesh = trimesh.creation.box(extents=2 * np.array(size))
     else:
@@ -82,6 +90,8 @@ def _swept_hull(kind: Kind, size: tuple[float, ...], pose: bytes, distance: floa
 
     Cached, because only link 6 differs between the angles of joint 7.
     """
+    import trimesh
+
     mesh = mesh_of(kind, size, np.frombuffer(pose).reshape(4, 4))
     hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
     normals, centres, bounds = (np.array(a) for a in (hull.face_normals, hull.triangles_center, hull.bounds))

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from mechsearch_jax.robot.gripper import FINGER, Gripper, RobotPart, primitives_in_gripper
+from mechsearch_jax.robot.gripper import Gripper, RobotPart, finger_parts, primitives_in_gripper
 from mechsearch_jax.robot.pads import between
 from mechsearch_jax.shapes.compound import Compound
 from mechsearch_jax.shapes.solid import surface
@@ -269,7 +269,8 @@ class OpenHand:
     @classmethod
     def of(cls, gripper: Gripper) -> OpenHand:
         """The boxes of a gripper, a little smaller than its parts."""
-        parts: Sequence[RobotPart] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[: 5 + 2 * len(FINGER)]
+        count = 5 + 2 * len(finger_parts())
+        parts: Sequence[RobotPart] = primitives_in_gripper(gripper, gripper.max_opening, 0.0)[:count]
         T = np.stack([part.T_frame_primitive for part in parts])
         return cls(np.maximum(np.array([part.size for part in parts]) - SLACK, 1e-3), T[:, :3, 3], T[:, :3, :3])
 

@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +32,7 @@ from mechsearch_jax.robot.entry import WaysIn, gripper_enters
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.shapes.compound import Compound
 from mechsearch_jax.workspace.shelf import Shelf
@@ -53,7 +53,7 @@ PIECES_PAIRS, ROUND_PAIRS = 16, 32
 NO_GRASP = 10.0
 
 
-class GraspTables(flax.struct.PyTreeNode):
+class GraspTables(PyTreeNode):
     """Grasps of the target and their swept clouds: constants of a `Problem`. Clouds are rows of coordinates [m].
 
     Attributes:

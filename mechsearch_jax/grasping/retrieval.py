@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +35,7 @@ from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import JOINTS
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -57,7 +57,7 @@ ALIKE, ALIKE_WRIST = math.radians(10), math.radians(20)
 FAR = 1_000_000
 
 
-class TargetGrasps(flax.struct.PyTreeNode):
+class TargetGrasps(PyTreeNode):
     """The grasps for a found target, and the cell that decides which of them are feasible.
 
     Attributes:
@@ -69,9 +69,9 @@ class TargetGrasps(flax.struct.PyTreeNode):
 
     tables: GraspTables
     shelf: Shelf
-    gripper: Gripper = flax.struct.field(pytree_node=False)
+    gripper: Gripper = static()
     target: Target
-    config: GraspConfig = flax.struct.field(pytree_node=False)
+    config: GraspConfig = static()
 
     def standing(self, pose: Float[Array, "3"]) -> Float[Array, "4 4"]:
         """`T_world_target` of the target standing on the board at x, y [m] and yaw [rad].
@@ -82,7 +82,7 @@ class TargetGrasps(flax.struct.PyTreeNode):
         return upright_pose(pose, self.target.height(self.shelf))
 
 
-class FoundGrasps(flax.struct.PyTreeNode):
+class FoundGrasps(PyTreeNode):
     """Feasibility of the F grasps of a found target, at any pose.
 
     Attributes:
@@ -96,7 +96,7 @@ class FoundGrasps(flax.struct.PyTreeNode):
     q: jax.Array
 
 
-class GraspChoice(flax.struct.PyTreeNode):
+class GraspChoice(PyTreeNode):
     """How to take out a found target.
 
     Attributes:

@@ -12,29 +12,28 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry.transforms import compose, exponential, inverse, make, matmul, rotate, transform
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, RobotPart
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.robot.gripper import FINGER_BASE, RobotPart, finger_parts, hand_parts, link_parts
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 
 HAND_FRAME = 7
 # Damping of directions that the robot's shape does not determine: as much as one point at this distance [m].
 LEVER = 0.1
 
-# Signed distances of points (P, 3) in the base frame to the robot's surface, and outward unit normals (P, 3), for joint
-# angles (7,) and the distance between the fingers.
-RobotDistance = Callable[[Array, Array, Array], tuple[Array, Array]]
+# Numbers of Gauss-Newton steps, each with the distance within which a point counts as the robot's [m]; the first
+# distance must be at least the error of the given pose at the robot.
+STAGES = ((10, 0.06), (10, 0.02), (10, 0.006))
+# The pose stays as given if fewer points are within the last stage's distance.
+LEAST_POINTS = 100
 
 
 class _Solids(NamedTuple):
@@ -53,11 +52,11 @@ def _solids() -> _Solids:
     lifted = np.eye(4)
     lifted[2, 3] = FINGER_BASE
     parts: list[tuple[int, np.ndarray, RobotPart, float]] = [
-        (i, np.eye(4), primitive, 0.0) for i, link in enumerate(LINKS) for primitive in link
+        (i, np.eye(4), primitive, 0.0) for i, link in enumerate(link_parts()) for primitive in link
     ]
-    parts += [(HAND_FRAME, np.eye(4), primitive, 0.0) for primitive in HAND]
-    parts += [(HAND_FRAME, lifted, primitive, 1.0) for primitive in FINGER]
-    parts += [(HAND_FRAME, lifted @ turned, primitive, -1.0) for primitive in FINGER]
+    parts += [(HAND_FRAME, np.eye(4), primitive, 0.0) for primitive in hand_parts()]
+    parts += [(HAND_FRAME, lifted, primitive, 1.0) for primitive in finger_parts()]
+    parts += [(HAND_FRAME, lifted @ turned, primitive, -1.0) for primitive in finger_parts()]
     box = [primitive.kind == "box" for _, _, primitive, _ in parts]
     return _Solids(
         frame=np.array([frame for frame, _, _, _ in parts]),
@@ -110,29 +109,7 @@ def panda_distance(
     return best
 
 
-@dataclasses.dataclass(frozen=True)
-class PoseConfig:
-    """How the camera's pose is refined.
-
-    Attributes:
-      stages: numbers of Gauss-Newton steps, each with the distance within which a point counts as the robot's [m]; the
-        first distance must be at least the error of the given pose at the robot.
-      robot_distance: the robot's shape.
-      minimum_points: the pose stays as given if fewer points are within the last stage's distance.
-    """
-
-    stages: tuple[tuple[int, float], ...] = ((10, 0.06), (10, 0.02), (10, 0.006))
-    robot_distance: RobotDistance = panda_distance
-    minimum_points: int = 100
-
-    def __post_init__(self):
-        if not self.stages or any(steps < 1 or distance <= 0 for steps, distance in self.stages):
-            raise InputError(f"PoseConfig: stages {self.stages} must be pairs of a number of steps and a distance")
-        if self.minimum_points < 6:
-            raise InputError(f"PoseConfig: minimum_points ({self.minimum_points}) must be at least 6")
-
-
-class PoseEstimate(flax.struct.PyTreeNode):
+class PoseEstimate(PyTreeNode):
     """A corrected camera pose.
 
     Attributes:
@@ -154,6 +131,8 @@ class PoseEstimate(flax.struct.PyTreeNode):
 
 def with_pose(camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> Camera:
     """The camera at another pose."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_matrix(np.asarray(T_world_camera[:3, :3], float)).as_matrix()
     return dataclasses.replace(
         camera,
@@ -162,14 +141,13 @@ def with_pose(camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> Camer
     )
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@jax.jit
 def estimate_pose(
     T_world_camera: Float[Array, "4 4"],
     points: Float[Array, "p 3"],
     valid: Bool[Array, " p"],
     joints: Float[Array, "7"],
     opening: Float[Array, ""],
-    config: PoseConfig | None = None,
 ) -> PoseEstimate:
     """Correct a camera's pose so that the observed points of the robot lie on the robot (appendix C.1).
 
@@ -179,20 +157,18 @@ def estimate_pose(
 
     Args:
       T_world_camera: the given pose; the world is the robot's base.
-      points: observed points in the camera's frame [m]; those farther from the robot than `config.stages` are ignored.
+      points: observed points in the camera's frame [m]; those farther from the robot than `STAGES` are ignored.
       valid: which points count; exclude the shelf and the objects.
       joints: the robot's joint angles when the image was taken [rad].
       opening: the distance between its fingers [m].
-      config: static; the default if None.
     """
-    config = config or PoseConfig()
     points = jnp.where(valid[:, None], points, 0.0)
     dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
     damping = jnp.diag(jnp.array([LEVER**2] * 3 + [1.0] * 3))
 
     def weights(T, reach):
         world = transform(T, points)
-        distance, normal = config.robot_distance(world, joints, opening)
+        distance, normal = panda_distance(world, joints, opening)
         share = jnp.minimum((distance / reach) ** 2, 1.0)
         return world, distance, normal, valid * (1.0 - share) ** 2
 
@@ -208,11 +184,11 @@ def estimate_pose(
         return make(matmul(turn, T[:3, :3]), rotate(turn, T[:3, 3]) + shift)
 
     T = T_world_camera
-    for steps, reach in config.stages:
+    for steps, reach in STAGES:
         T = jax.lax.fori_loop(0, steps, functools.partial(step, reach=reach), T)
-    _, distance, _, weight = weights(T, config.stages[-1][1])
+    _, distance, _, weight = weights(T, STAGES[-1][1])
     on = weight > 0.0
     count = jnp.sum(on)
-    corrected = (count >= config.minimum_points) & jnp.all(jnp.isfinite(T))
+    corrected = (count >= LEAST_POINTS) & jnp.all(jnp.isfinite(T))
     error = jnp.sqrt(jnp.sum(jnp.where(on, distance, 0.0) ** 2) / jnp.maximum(count, 1))
     return PoseEstimate(jnp.where(corrected, T, T_world_camera), count.astype(jnp.int32), error, corrected)

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 
 from mechsearch_jax.images.cloud import BLOCK, View, above_board, density, shelf_view, thinned_view
 from mechsearch_jax.images.detection import coloured_pixels
@@ -191,11 +190,15 @@ class Part:
 
 def _numbered(pixels: Bool[np.ndarray, "h w"], around: np.ndarray | None = None) -> Int[np.ndarray, "h w"]:
     """A number for each pixel, the same for connected ones; 0 for the others."""
+    from scipy import ndimage
+
     return np.asarray(ndimage.label(pixels, around)[0])  # pyright: ignore[reportIndexIssue]
 
 
 def hole_faults(look: Look) -> tuple[str, ...]:
     """A warning if connected pixels without a measurement could hide a small object in the shelf."""
+    from scipy import ndimage
+
     part = look.thinned
     into = _into_shelf(part)
     side = max(3, round(SMALL * density(part.view.camera, look.shelf)))

@@ -11,13 +11,13 @@ import dataclasses
 import functools
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -154,7 +154,7 @@ def thinned_view(camera: Camera, shelf: Shelf) -> View:
     return shelf_view(camera, shelf, max(1, round(STRIDE * finer)), BLOCK)
 
 
-class PointCloud(flax.struct.PyTreeNode):
+class PointCloud(PyTreeNode):
     """P points in the world, of which any may be absent.
 
     Attributes:

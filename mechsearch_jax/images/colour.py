@@ -8,16 +8,14 @@ import functools
 import math
 from collections.abc import Callable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse.csgraph
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import KDTree
 
 from mechsearch_jax.images.labels import OTHER
 from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).
 ColourDifference = Callable[[Array, Array], Array]
@@ -146,14 +144,14 @@ class TargetColour:
         check_range("TargetColour: hue_tolerance", tolerance, 1.0, LARGEST_HUE, "degrees")
         if len(rgb) != 3 or not all(0 <= c <= 1 for c in rgb):
             raise InputError(
-                f"TargetColour: color {tuple(rgb)} must be red, green and blue, each from 0 to 1; divide 8-bit values "
+                f"TargetColour: colour {tuple(rgb)} must be red, green and blue, each from 0 to 1; divide 8-bit values "
                 "by 255"
             )
         spread = max(rgb) - min(rgb)
         if spread < LEAST_TARGET_CHROMA or spread < LEAST_TARGET_SATURATION * max(rgb):
             raise InputError(
-                f"TargetColour: color {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells the "
-                "target from other things; give masks with target_id instead"
+                f"TargetColour: colour {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells "
+                "the target from other things; give masks with target_id instead"
             )
         return cls(rgb, threshold=1.0, difference=hue_difference if tolerance == HUE else HueDifference(tolerance))
 
@@ -177,7 +175,7 @@ def rgb_of_hue(hue: float, saturation: float) -> tuple[float, float, float]:
     return colorsys.hsv_to_rgb(hue / 360.0, saturation, 1.0)
 
 
-class ColourDetection(flax.struct.PyTreeNode):
+class ColourDetection(PyTreeNode):
     """Which segment is the target.
 
     Attributes:
@@ -213,31 +211,17 @@ def detect_target(
     return ColourDetection(jnp.sum(is_like_target) == 1, jnp.argmin(difference).astype(jnp.int32), difference)
 
 
-@dataclasses.dataclass(frozen=True)
-class ClusterConfig:
-    """When neighbouring pixels belong to the same segment.
-
-    Attributes:
-      colour: largest distance between the chromaticities of neighbours.
-      depth: largest difference between the depths of neighbours [m].
-      rejoin: parts with mean chromaticities within `colour` and a gap of at most this are one segment, which something
-        in front splits [m].
-      minimum: segments with fewer pixels are dropped.
-    """
-
-    colour: float = 0.05
-    depth: float = 0.015
-    rejoin: float = 0.04
-    minimum: int = 20
-
-    def __post_init__(self):
-        if not (self.colour > 0 and self.depth > 0 and self.rejoin >= 0 and self.minimum >= 1):
-            raise InputError(f"ClusterConfig: lengths must be positive, minimum at least 1, not {self}")
+# Neighbouring pixels are of one segment if their chromaticities differ by at most `ALIKE`, and their depths by at most
+# `STEP` [m]. Parts with mean chromaticities as alike and a gap of at most `REJOIN` are one, too, which something in
+# front splits [m]. Segments of fewer than `LEAST_PIXELS` are dropped.
+ALIKE, STEP, REJOIN, LEAST_PIXELS = 0.05, 0.015, 0.04, 20
 
 
 def _components(size: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    graph = scipy.sparse.coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    from scipy.sparse import coo_array, csgraph
+
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size))
+    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def cluster_by_colour(
@@ -245,7 +229,6 @@ def cluster_by_colour(
     depth: Float[np.ndarray, "h w"],
     points: Float[np.ndarray, "h w 3"],
     foreground: Bool[np.ndarray, "h w"],
-    config: ClusterConfig | None = None,
 ) -> Int[np.ndarray, "h w"]:
     """Connected segments of similar colour, for images without a mask.
 
@@ -257,19 +240,19 @@ def cluster_by_colour(
       depth: along the camera's axis [m].
       points: of the pixels, in the world [m].
       foreground: pixels to be clustered.
-      config: the default if None.
 
     Returns:
       segment of every pixel, numbered by decreasing size; `labels.OTHER` for none.
     """
-    config = config or ClusterConfig()
+    from scipy.spatial import KDTree
+
     tint = np.array(chromaticity(jnp.asarray(colour, jnp.float32)))
     index = np.arange(foreground.size).reshape(foreground.shape)
     pairs = []
     for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])):
         with np.errstate(invalid="ignore"):
-            near = np.abs(depth[first] - depth[second]) <= config.depth
-        alike = np.linalg.norm(tint[first] - tint[second], axis=-1) <= config.colour
+            near = np.abs(depth[first] - depth[second]) <= STEP
+        alike = np.linalg.norm(tint[first] - tint[second], axis=-1) <= ALIKE
         linked = foreground[first] & foreground[second] & near & alike
         pairs.append((index[first][linked], index[second][linked]))
     part = _components(foreground.size, *(np.concatenate(ends) for ends in zip(*pairs, strict=True)))
@@ -277,7 +260,7 @@ def cluster_by_colour(
     names, part = np.unique(part, return_inverse=True)
     part = part - (names[0] == -1)
     sizes = np.bincount(part[part >= 0], minlength=1)
-    large = np.flatnonzero(sizes >= config.minimum)
+    large = np.flatnonzero(sizes >= LEAST_PIXELS)
 
     if not large.size:
         return np.full(foreground.shape, OTHER, np.int32)
@@ -289,8 +272,8 @@ def cluster_by_colour(
         (i, j)
         for i in range(len(large))
         for j in range(i)
-        if np.linalg.norm(means[i] - means[j]) <= config.colour
-        and np.min(trees[i].query(flat[members[j]], distance_upper_bound=config.rejoin)[0]) <= config.rejoin
+        if np.linalg.norm(means[i] - means[j]) <= ALIKE
+        and np.min(trees[i].query(flat[members[j]], distance_upper_bound=REJOIN)[0]) <= REJOIN
     ]
     whole = _components(len(large), *np.array(joined, int).reshape(-1, 2).T)
     labels = np.full(foreground.size, OTHER, np.int32)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
@@ -33,6 +32,7 @@ from mechsearch_jax.images.target_pose import (
     upright_placements,
     within_shelf,
 )
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -183,7 +183,7 @@ def without_phantoms(
     return jnp.where(phantom, OTHER, labels).astype(labels.dtype)
 
 
-class ColouredDepth(flax.struct.PyTreeNode):
+class ColouredDepth(PyTreeNode):
     """A depth image with colours.
 
     Attributes:
@@ -197,7 +197,7 @@ class ColouredDepth(flax.struct.PyTreeNode):
     colour: jax.Array
 
 
-class Detection(flax.struct.PyTreeNode):
+class Detection(PyTreeNode):
     """The target in an image.
 
     Attributes:
@@ -269,7 +269,7 @@ def detect(
     return jax.lax.while_loop(goes_on, look, (jnp.int32(0), coloured, no_detection(image.depth)))[2]
 
 
-class _Scene(flax.struct.PyTreeNode):
+class _Scene(PyTreeNode):
     """What is the same at every place: the pixels, which are near the shelf's space, the camera's position, ..."""
 
     sample: SampledPixels

@@ -2,48 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 UP = (0.0, 0.0, 1.0)
+# Number of tried planes through three random points, and how often the best is then fitted to the points on it.
+HYPOTHESES, FITS = 256, 3
+# Largest distance from a plane of a point on it [m].
+TOLERANCE = 0.004
+# Largest angle between the plane's normal and the expected one [rad].
+WITHIN = math.radians(10.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class PlaneConfig:
-    """How a plane is searched.
-
-    Attributes:
-      hypotheses: number of tried planes through three random points.
-      tolerance: largest distance from a plane of a point on it [m].
-      within: largest angle between the plane's normal and the expected one [rad].
-      fits: how often the best plane is then fitted to the points on it.
-    """
-
-    hypotheses: int = 256
-    tolerance: float = 0.004
-    within: float = math.radians(10.0)
-    fits: int = 3
-
-    def __post_init__(self):
-        if self.hypotheses < 1 or self.fits < 0:
-            raise InputError(
-                f"PlaneConfig: hypotheses ({self.hypotheses}) must be at least 1, fits ({self.fits}) at least 0"
-            )
-        if not (self.tolerance > 0 and 0 < self.within <= math.pi / 2):
-            raise InputError(
-                f"PlaneConfig: tolerance ({self.tolerance}) must be positive, within ({self.within}) in (0, pi/2]"
-            )
-
-
-class Plane(flax.struct.PyTreeNode):
+class Plane(PyTreeNode):
     """All x with `normal @ x = offset`.
 
     Attributes:
@@ -61,9 +38,9 @@ class Plane(flax.struct.PyTreeNode):
         return sum(points[..., k] * self.normal[k] for k in range(3)) - self.offset
 
 
-def _fitted(plane: Plane, points: Array, valid: Array, config: PlaneConfig) -> Plane:
+def _fitted(plane: Plane, points: Array, valid: Array) -> Plane:
     """The least-squares plane of the points on a plane; its normal is the direction of their least spread."""
-    on = (valid & (jnp.abs(plane.height(points)) <= config.tolerance)).astype(points.dtype)
+    on = (valid & (jnp.abs(plane.height(points)) <= TOLERANCE)).astype(points.dtype)
     count = jnp.sum(on)
     centre = jnp.sum(points * on[:, None], axis=0) / jnp.maximum(count, 1.0)
     offset = (points - centre[None]) * on[:, None]
@@ -74,13 +51,12 @@ def _fitted(plane: Plane, points: Array, valid: Array, config: PlaneConfig) -> P
     return jax.tree.map(lambda a, b: jnp.where(count >= 3.0, a, b), better, plane)
 
 
-@functools.partial(jax.jit, static_argnames=("expected", "config"))
+@functools.partial(jax.jit, static_argnames="expected")
 def find_plane(
     key: Array,
     points: Float[Array, "p 3"],
     valid: Bool[Array, " p"],
     expected: tuple[float, float, float] = UP,
-    config: PlaneConfig | None = None,
 ) -> Plane:
     """The plane with most points on it, of those with a normal near a direction.
 
@@ -92,13 +68,11 @@ def find_plane(
       points: in the world [m].
       valid: which points count.
       expected: unit vector near the normal; static.
-      config: static; the default if None.
     """
-    config = config or PlaneConfig()
     points = jnp.where(valid[:, None], points, 0.0)
     direction = jnp.array(expected)
     rank = jnp.cumsum(valid)
-    draws = jax.random.uniform(key, (config.hypotheses, 3)) * rank[-1]
+    draws = jax.random.uniform(key, (HYPOTHESES, 3)) * rank[-1]
     triples = points[jnp.minimum(jnp.searchsorted(rank, jnp.floor(draws).astype(rank.dtype) + 1), len(points) - 1)]
     cross = jnp.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     square = jnp.sum(cross**2, axis=-1)
@@ -106,18 +80,18 @@ def find_plane(
     normals = cross / jnp.sqrt(jnp.where(flat, square, 1.0))[:, None]
     along = jnp.sum(normals * direction[None], axis=-1)
     normals = normals * jnp.where(along < 0.0, -1.0, 1.0)[:, None]
-    plausible = flat & (jnp.abs(along) >= math.cos(config.within))
+    plausible = flat & (jnp.abs(along) >= math.cos(WITHIN))
 
     def hypothesis(normal, point):
         plane = Plane(normal, jnp.sum(normal * point), jnp.int32(0))
-        return plane.replace(support=jnp.sum(valid & (jnp.abs(plane.height(points)) <= config.tolerance)))
+        return plane.replace(support=jnp.sum(valid & (jnp.abs(plane.height(points)) <= TOLERANCE)))
 
     planes = jax.lax.map(lambda pair: hypothesis(*pair), (normals, triples[:, 0]), batch_size=16)
     best = jnp.argmax(jnp.where(plausible, planes.support, -1))
     has_plane = plausible[best] & (planes.support[best] >= 3)
     nothing = Plane(direction, jnp.float32(0.0), jnp.int32(0))
     plane = jax.tree.map(lambda a, b: jnp.where(has_plane, a[best].astype(b.dtype), b), planes, nothing)
-    for _ in range(config.fits):
-        fitted = _fitted(plane, points, valid, config)
+    for _ in range(FITS):
+        fitted = _fitted(plane, points, valid)
         plane = jax.tree.map(lambda a, b: jnp.where(has_plane, a, b), fitted, plane)
     return plane

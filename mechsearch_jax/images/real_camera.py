@@ -11,21 +11,19 @@ runs once per image on the host:
 
 from __future__ import annotations
 
-import dataclasses
-
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.images.camera_pose import PoseConfig, PoseEstimate, estimate_pose
+from mechsearch_jax.images.camera_pose import STAGES, PoseEstimate, estimate_pose, panda_distance
 from mechsearch_jax.images.checks import check_images
-from mechsearch_jax.images.colour import ClusterConfig, ColourDetection, TargetColour, cluster_by_colour, detect_target
+from mechsearch_jax.images.colour import ColourDetection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.images.detection import evened
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
+from mechsearch_jax.images.planes import Plane, find_plane
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -33,50 +31,20 @@ _evened = jax.jit(evened)
 
 # Largest number of points for the plane of the floor and for the camera's pose.
 FLOOR_POINTS = ROBOT_POINTS = 4096
+# How far objects may stick out in front of the shelf [m].
+OVERHANG = 0.02
+# Points closer than this to the walls or the upper board are the shelf's [m].
+WALL_CLEARANCE = 0.012
+# Largest distance from the board of points that may be the floor's; those less than the second above its plane are [m].
+FLOOR_SEARCH, FLOOR_CLEARANCE = 0.03, 0.005
+# Least number of points on the floor's plane; with fewer, the shelf's board is used.
+FLOOR_SUPPORT = 200
+# Points this close to the robot are the robot's, if its joint angles are given; least distance in front of the shelf of
+# points that are matched with it [m].
+ROBOT_CLEARANCE, ROBOT_MARGIN = 0.02, 0.05
 
 
-@dataclasses.dataclass(frozen=True)
-class RealCameraConfig:
-    """How images are prepared; lengths in metres.
-
-    Attributes:
-      segments: largest number of segments: eight objects and the target.
-      overhang: how far objects may stick out in front of the shelf.
-      wall_clearance: points closer than this to the walls or the upper board are the shelf's.
-      floor_search: largest distance from the board of points that may be the floor's.
-      floor_clearance: points less than this above the floor's plane are the floor's.
-      floor_support: least number of points on the floor's plane; with fewer, the shelf's board is used.
-      robot_clearance: points this close to the robot are the robot's, if its joint angles are given.
-      robot_margin: least distance in front of the shelf of points that are matched with the robot.
-      pose: how the camera's pose is corrected.
-      plane: how the floor's plane is fitted.
-      clusters: how pixels are clustered by colour.
-      target: the target's colour.
-    """
-
-    segments: int = INSTANCES
-    overhang: float = 0.02
-    wall_clearance: float = 0.012
-    floor_search: float = 0.03
-    floor_clearance: float = 0.005
-    floor_support: int = 200
-    robot_clearance: float = 0.02
-    robot_margin: float = 0.05
-    pose: PoseConfig = dataclasses.field(default_factory=PoseConfig)
-    plane: PlaneConfig = dataclasses.field(default_factory=PlaneConfig)
-    clusters: ClusterConfig = dataclasses.field(default_factory=ClusterConfig)
-    target: TargetColour = dataclasses.field(default_factory=TargetColour.lit)
-
-    def __post_init__(self):
-        if not 1 <= self.segments <= INSTANCES:
-            raise InputError(f"RealCameraConfig: segments ({self.segments}) must be from 1 to {INSTANCES}")
-        lengths = ("overhang", "wall_clearance", "floor_search", "floor_clearance", "robot_clearance", "robot_margin")
-        for field in lengths:
-            if not getattr(self, field) >= 0:
-                raise InputError(f"RealCameraConfig: {field} ({getattr(self, field)}) must not be negative, in metres")
-
-
-class PreparedImage(flax.struct.PyTreeNode):
+class PreparedImage(PyTreeNode):
     """A prepared depth and colour image.
 
     Attributes:
@@ -96,7 +64,7 @@ class PreparedImage(flax.struct.PyTreeNode):
     detection: ColourDetection
     floor: Plane
     pose: PoseEstimate | None
-    camera: Camera = flax.struct.field(pytree_node=False)
+    camera: Camera = static()
 
     @property
     def target_id(self) -> jax.Array:
@@ -126,42 +94,42 @@ def _fixed(rng: np.random.Generator, points: np.ndarray, count: int) -> tuple[Ar
     return jnp.asarray(padded), jnp.arange(count) < len(chosen)
 
 
-def _correct_pose(rng, camera, shelf, points, joints, opening, config) -> PoseEstimate:
+def _correct_pose(rng, camera, shelf, points, joints, opening) -> PoseEstimate:
     """The camera's pose from the points in front of the shelf, where there is only the robot."""
     rotation, position = np.array(camera.rotation), np.array(camera.position)
-    in_front = points[:, 0] < shelf.front - config.robot_margin
-    within = max(reach for _, reach in config.pose.stages)
-    distance, _ = config.pose.robot_distance(jnp.asarray(points[in_front]), joints, opening)
+    in_front = points[:, 0] < shelf.front - ROBOT_MARGIN
+    within = max(reach for _, reach in STAGES)
+    distance, _ = panda_distance(jnp.asarray(points[in_front]), joints, opening)
     near = points[in_front][np.asarray(distance) < within]
     local, valid = _fixed(rng, (near - position) @ rotation, ROBOT_POINTS)
     T_world_camera = np.eye(4, dtype=np.float32)
     T_world_camera[:3, :3], T_world_camera[:3, 3] = rotation, position
-    return estimate_pose(jnp.asarray(T_world_camera), local, valid, joints, opening, config.pose)
+    return estimate_pose(jnp.asarray(T_world_camera), local, valid, joints, opening)
 
 
-def _find_floor(key, rng, shelf, points, inside, config) -> Plane:
-    low = inside & (np.abs(points[..., 2] - shelf.board) <= config.floor_search)
-    floor = find_plane(key, *_fixed(rng, points[low], FLOOR_POINTS), config=config.plane)
-    if int(floor.support) >= config.floor_support:
+def _find_floor(key, rng, shelf, points, inside) -> Plane:
+    low = inside & (np.abs(points[..., 2] - shelf.board) <= FLOOR_SEARCH)
+    floor = find_plane(key, *_fixed(rng, points[low], FLOOR_POINTS))
+    if int(floor.support) >= FLOOR_SUPPORT:
         return floor
     return Plane(jnp.array([0.0, 0.0, 1.0]), jnp.float32(shelf.board), jnp.int32(0))
 
 
-def _segment(colour, depth, points, foreground, mask, config) -> Int[np.ndarray, "h w"]:
+def _segment(colour, depth, points, foreground, mask) -> Int[np.ndarray, "h w"]:
     if mask is None:
-        labels = cluster_by_colour(colour, depth, points, foreground, config.clusters)
+        labels = cluster_by_colour(colour, depth, points, foreground)
     else:
         labels = np.where(foreground, mask, OTHER).astype(np.int32)
-    return np.where((labels >= 0) & (labels < config.segments), labels, OTHER).astype(np.int32)
+    return np.where((labels >= 0) & (labels < INSTANCES), labels, OTHER).astype(np.int32)
 
 
-def _inside(shelf: Shelf, points: np.ndarray, config: RealCameraConfig) -> Bool[np.ndarray, "h w"]:
+def _inside(shelf: Shelf, points: np.ndarray) -> Bool[np.ndarray, "h w"]:
     """Which points lie between the shelf's walls and below its upper board; its floor is ignored."""
     x, y, z = np.moveaxis(points, -1, 0)
-    c = config.wall_clearance
+    c = WALL_CLEARANCE
     with np.errstate(invalid="ignore"):
         return (
-            (x > shelf.front - config.overhang)
+            (x > shelf.front - OVERHANG)
             & (x < shelf.back - c)
             & (y > shelf.right + c)
             & (y < shelf.left - c)
@@ -178,7 +146,7 @@ def prepare(
     mask: np.ndarray | None = None,
     joints: Float[np.ndarray, " 7"] | None = None,
     opening: float = 0.0,
-    config: RealCameraConfig | None = None,
+    target: TargetColour | None = None,
 ) -> PreparedImage:
     """Segment the objects in a depth and a colour image of the shelf.
 
@@ -188,17 +156,16 @@ def prepare(
       shelf: the shelf.
       depth: along the camera's axis [m]; 0, infinite or NaN where nothing was measured.
       colour: red, green and blue in 0 to 1, registered to the depth image, float, shape (h, w, 3).
-      mask: whole numbers, the segment of every pixel, 0 to `config.segments - 1`, others for none; it need not separate
+      mask: whole numbers, the segment of every pixel, 0 to 8, others for none; it need not separate
         shelf and robot. If None, pixels are clustered by colour.
       joints: the robot's joint angles when the images were taken [rad]; without them the pose is used as given, and the
         robot must be out of sight.
       opening: distance between its fingers [m].
-      config: the default if None.
+      target: the target's colour; red if None.
 
     Raises:
       InputError: an image has the wrong size, type or unit.
     """
-    config = config or RealCameraConfig()
     depth = _checked(camera, depth, colour, mask)
     # The host draws the points, whose number differs between images; the key's bits are the seed.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
@@ -206,23 +173,23 @@ def prepare(
     if joints is not None:
         angles, fingers = jnp.asarray(joints, jnp.float32), jnp.float32(opening)
         seen = np.asarray(back_project(camera, jnp.asarray(depth)))[np.isfinite(depth)]
-        pose = _correct_pose(rng, camera, shelf, seen, angles, fingers, config)
+        pose = _correct_pose(rng, camera, shelf, seen, angles, fingers)
         camera = pose.camera(camera)
     # With noise, an object would be split, and pixels of the target would be missed and taken for an object in it.
     colour = np.asarray(_evened(jnp.asarray(colour, jnp.float32), jnp.asarray(depth)))
     points = np.asarray(back_project(camera, jnp.asarray(depth)))
-    inside = _inside(shelf, points, config)
-    floor = _find_floor(key, rng, shelf, points, inside, config)
-    foreground = inside & (np.asarray(floor.height(jnp.asarray(points))) > config.floor_clearance)
+    inside = _inside(shelf, points)
+    floor = _find_floor(key, rng, shelf, points, inside)
+    foreground = inside & (np.asarray(floor.height(jnp.asarray(points))) > FLOOR_CLEARANCE)
     # Things in front of the shelf hide what is in it.
-    other = (points[..., 0] <= shelf.front - config.overhang) & (points[..., 2] > shelf.board)
+    other = (points[..., 0] <= shelf.front - OVERHANG) & (points[..., 2] > shelf.board)
     if joints is not None:
-        distance, _ = config.pose.robot_distance(jnp.asarray(points[foreground]), angles, fingers)
-        other[foreground] = np.asarray(distance) <= config.robot_clearance
+        distance, _ = panda_distance(jnp.asarray(points[foreground]), angles, fingers)
+        other[foreground] = np.asarray(distance) <= ROBOT_CLEARANCE
         foreground &= ~other
-    labels = _segment(colour, depth, points, foreground, mask, config)
+    labels = _segment(colour, depth, points, foreground, mask)
     labels = np.where(foreground | other, labels, np.where(np.isfinite(depth), FREE, MISSING)).astype(np.int32)
     image = jnp.asarray(labels)
     pixels = jnp.asarray(colour, jnp.float32).reshape(-1, 3)
-    detection = detect_target(pixels, image.reshape(-1), config.segments, config.target)
+    detection = detect_target(pixels, image.reshape(-1), INSTANCES, target or TargetColour.lit())
     return PreparedImage(image, jnp.asarray(depth), detection, floor, pose, camera)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
@@ -14,6 +13,7 @@ from mechsearch_jax.geometry.transforms import inverse, make, transform
 from mechsearch_jax.images.cloud import draw
 from mechsearch_jax.images.labels import FREE, MISSING
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -54,7 +54,7 @@ class SegmentConfig:
         return self.inner + self.edge + self.context
 
 
-class Segments(flax.struct.PyTreeNode):
+class Segments(PyTreeNode):
     """The clouds of an image's segments; every field has the leading axes (..., S).
 
     A segment's frame has its origin on the board beneath the mean of the segment's points, z up, and x along the

@@ -8,13 +8,13 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import exponential, matmul, yaw_rotation
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes.solid import Solid
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -141,14 +141,14 @@ def target_poses(
     return poses.at[:, 2].set(turned), costs
 
 
-class Placement(flax.struct.PyTreeNode):
+class Placement(PyTreeNode):
     """A pose of the target in the world: `R_world_target`, shape (..., 3, 3), and its centre [m], shape (..., 3)."""
 
     rotation: jax.Array
     centre: jax.Array
 
 
-class SampledPixels(flax.struct.PyTreeNode):
+class SampledPixels(PyTreeNode):
     """N pixels of an image.
 
     Attributes:
@@ -166,7 +166,7 @@ class SampledPixels(flax.struct.PyTreeNode):
     tolerance: jax.Array
 
 
-class Evidence(flax.struct.PyTreeNode):
+class Evidence(PyTreeNode):
     """The numbers of pixels that speak for and against a placement."""
 
     support: jax.Array

@@ -19,7 +19,6 @@ import math
 from typing import Any, Literal, cast
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -28,6 +27,7 @@ from mechsearch_jax.networks.layers import FeedForward
 from mechsearch_jax.networks.push_contacts import perpendicular
 from mechsearch_jax.networks.push_geometry import Parity, PushGeometry, PushStart, push_geometry
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Units of the network's outputs: lengths [m], angles [rad].
 _SHIFT, _TURN = 0.05, 0.3
@@ -58,7 +58,7 @@ class PushConfig:
             raise InputError(f'PushConfig: frame "{self.frame}" is unknown; use "push" or "world"')
 
 
-class PushMotion(flax.struct.PyTreeNode):
+class PushMotion(PyTreeNode):
     """The network's output for each object; every field has the leading axis (N,).
 
     Attributes:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.footprints import TOUCH, Footprints, turned
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Number of directions over half a turn in which an object's extents are features; even.
 DIRECTIONS = 8
@@ -94,7 +94,7 @@ def pusher_distance(
     return _grazing(enters, leaves, widest - jnp.abs(lateral), longest), level
 
 
-class Meetings(flax.struct.PyTreeNode):
+class Meetings(PyTreeNode):
     """Contacts of object i with object j if i moves along the heading; leading axes (N, N).
 
     Distances are exact for two boxes, whose gaps are lower bounds. A cylinder's contact is computed with a

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from typing import Literal, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from mechsearch_jax.networks.push_contacts import (
     pusher_distance,
     reach,
 )
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Number of points of the gripper.
@@ -44,7 +44,7 @@ _IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
 
 
-class Parity(flax.struct.PyTreeNode):
+class Parity(PyTreeNode):
     """Features by their parity under reflection at the frame's first axis; any leading axes.
 
     Attributes:
@@ -56,7 +56,7 @@ class Parity(flax.struct.PyTreeNode):
     odd: jax.Array
 
 
-class PushGeometry(flax.struct.PyTreeNode):
+class PushGeometry(PyTreeNode):
     """Input features of a push, in the frame of `PushConfig`; lengths in units of 10 cm unless [m] is given.
 
     Attributes:
@@ -97,7 +97,7 @@ def _soft_contacts(distance: Array, level: Array, points: Array, heading: Array)
     return mean(weight**STRICTER), mean(weight)
 
 
-class PushStart(flax.struct.PyTreeNode):
+class PushStart(PyTreeNode):
     """A push as it begins.
 
     Attributes:

@@ -14,7 +14,6 @@ import dataclasses
 from typing import Any, cast
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +23,7 @@ from mechsearch_jax.geometry.transforms import matmul
 from mechsearch_jax.images.segments import MARKS
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape, shape_of
 
 BOX_YAWS, LYING_YAWS = 6, 6
@@ -73,7 +73,7 @@ class RecognitionConfig:
             raise InputError("RecognitionConfig: width, layers and heads must be positive, and heads divide width")
 
 
-class Hypotheses(flax.struct.PyTreeNode):
+class Hypotheses(PyTreeNode):
     """Hypotheses about a segment, in the segment's frame; every field has the leading axes (..., 13).
 
     Attributes:

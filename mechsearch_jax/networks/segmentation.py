@@ -14,7 +14,6 @@ import functools
 from typing import Any, cast
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -22,6 +21,7 @@ from jaxtyping import Array, Float, Int
 from mechsearch_jax.images.labels import INSTANCES
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Origin of the network's frame, the middle of the shelf's space [m].
 MIDDLE = (0.6, 0.1, 0.5)
@@ -56,7 +56,7 @@ class SegmentationConfig:
             raise InputError(f"SegmentationConfig: latents {self.latents} must be at least {INSTANCES}")
 
 
-class SegmentationOutput(flax.struct.PyTreeNode):
+class SegmentationOutput(PyTreeNode):
     """The network's output for the points of a cloud.
 
     Attributes:

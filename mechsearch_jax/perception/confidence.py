@@ -8,7 +8,6 @@ probability that the object is right to 2 cm and 15 degrees (docs/experiments.md
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -18,6 +17,7 @@ from mechsearch_jax.perception.hypotheses import SLOTS, pixels_of
 from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.selection import Costs, Sample, passed, point_cost
 from mechsearch_jax.perception.solids import surface_distance
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Logarithm of the odds that an object is wrong: a constant, and by how much it grows with each logarithm.
 BIAS, PER_ERROR, PER_MISFIT, PER_MARGIN = 6.137, 1.271, 0.451, -0.164
@@ -26,7 +26,7 @@ ERRORS = (1e-4, 0.02)
 LEAST_MISFIT, LEAST_MARGIN = 0.01, 0.01
 
 
-class Measures(flax.struct.PyTreeNode):
+class Measures(PyTreeNode):
     """What is measured of each object, shape (8,).
 
     Attributes:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Protocol
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
@@ -40,6 +39,7 @@ from mechsearch_jax.perception.selection import (
 from mechsearch_jax.perception.solids import penetrations, surface_distance
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -78,7 +78,7 @@ class ExplanationConfig(Costs):
                 raise InputError(f"ExplanationConfig: {name} ({number}) must be at most {most}")
 
 
-class Fitted(flax.struct.PyTreeNode):
+class Fitted(PyTreeNode):
     """What was made of a labelled image.
 
     Attributes:
@@ -200,7 +200,7 @@ def explained_image(
     return _explain(keys[0], image, fitted_target, (shapes, camera, shelf, refinement), config, least)
 
 
-class _FittedTarget(flax.struct.PyTreeNode):
+class _FittedTarget(PyTreeNode):
     """The target: its body in one slot, absent if it is not visible; its pose; and the pixels on it."""
 
     body: Superquadrics

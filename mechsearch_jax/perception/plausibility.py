@@ -16,7 +16,7 @@ from mechsearch_jax.calibration.fit import FACES, Face
 from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.detection import fitted_pose
-from mechsearch_jax.images.planes import PlaneConfig, find_plane
+from mechsearch_jax.images.planes import TOLERANCE, find_plane
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
@@ -98,7 +98,7 @@ def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
     padded = np.zeros((FLOOR_POINTS, 3), np.float32)
     padded[: len(chosen)] = chosen
     valid = jnp.arange(FLOOR_POINTS) < len(chosen)
-    plane = find_plane(jax.random.key(0), jnp.asarray(padded), valid, config=PlaneConfig())
+    plane = find_plane(jax.random.key(0), jnp.asarray(padded), valid)
     if int(plane.support) < FLOOR_SUPPORT:
         return (
             f"depth image: shows no board within {100 * FLOOR_SEARCH:.0f} cm of z = {shelf.board:.3f} m; check the "
@@ -143,8 +143,8 @@ def _wall_fault(shelf: Shelf, wall: Face, points: Float[np.ndarray, "n 3"]) -> s
     padded = np.zeros((FLOOR_POINTS, 3), np.float32)
     padded[: len(local)] = local
     valid = jnp.arange(FLOOR_POINTS) < len(local)
-    plane = find_plane(jax.random.key(0), jnp.asarray(padded), valid, config=PlaneConfig())
-    on = np.abs(np.asarray(plane.height(jnp.asarray(local, jnp.float32)))) <= PlaneConfig.tolerance
+    plane = find_plane(jax.random.key(0), jnp.asarray(padded), valid)
+    on = np.abs(np.asarray(plane.height(jnp.asarray(local, jnp.float32)))) <= TOLERANCE
     if int(plane.support) < WALL_SUPPORT:
         return None
     first, last = np.percentile(local[on, 1], (5, 95))

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
@@ -22,7 +21,6 @@ from mechsearch_jax.images.detection import ColouredDepth, coloured_pixels, dete
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.edges import on_own_surfaces
 from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
@@ -31,11 +29,15 @@ from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.own_settings import in_own_settings, own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
+
+if TYPE_CHECKING:
+    from mechsearch_jax.networks.weights import Weights
 
 # Gives the target's pixels, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
@@ -70,7 +72,7 @@ class ViewImages(NamedTuple):
     target_id: Any = None
 
 
-class ViewRecogniser(flax.struct.PyTreeNode):
+class ViewRecogniser(PyTreeNode):
     """Recognises what the images of a view show: the part of recognition that robots and simulated cameras share.
 
     A pytree, whose leaves are the networks' weights.
@@ -88,10 +90,10 @@ class ViewRecogniser(flax.struct.PyTreeNode):
     segmenter: Segmenter
     shapes: ShapeNetwork
     detector: TargetDetector
-    target: Target = flax.struct.field(pytree_node=False)
-    refinement: RefinementConfig = flax.struct.field(pytree_node=False, default_factory=RefinementConfig)
-    fitter: Fitter = flax.struct.field(pytree_node=False, default_factory=Explaining)
-    mask_fitter: Fitter = flax.struct.field(pytree_node=False, default=as_segmented)
+    target: Target = static()
+    refinement: RefinementConfig = static(default_factory=RefinementConfig)
+    fitter: Fitter = static(default_factory=Explaining)
+    mask_fitter: Fitter = static(default=as_segmented)
 
     @classmethod
     def of(

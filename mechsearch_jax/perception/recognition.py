@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
@@ -16,13 +15,16 @@ from mechsearch_jax.images.cloud import middle
 from mechsearch_jax.images.detection import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.images.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
-from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+
+if TYPE_CHECKING:
+    from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork
+    from mechsearch_jax.networks.weights import Weights
 
 
 def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics:
@@ -107,13 +109,15 @@ def recognise_with_error(
     config: SegmentConfig | None = None,
 ) -> tuple[Superquadrics, Float[Array, " s"]]:
     """`recognise`, and the network's `expected_error` of each [m]."""
+    from mechsearch_jax.networks.recognition import apply_network
+
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)
     eyes = nearness(camera, shelf or Shelf()) * segments.camera
     hypotheses = apply_network(network, parameters, segments.points, segments.mark, eyes)
     return best_hypothesis(hypotheses, segments), expected_error(hypotheses)
 
 
-class ShapeNetwork(flax.struct.PyTreeNode):
+class ShapeNetwork(PyTreeNode):
     """A trained recognition network.
 
     Attributes:
@@ -123,17 +127,19 @@ class ShapeNetwork(flax.struct.PyTreeNode):
     """
 
     parameters: Any
-    network: RecognitionNetwork = flax.struct.field(pytree_node=False)
-    view: TrainedView | None = flax.struct.field(pytree_node=False, default=None)
+    network: RecognitionNetwork = static()
+    view: TrainedView | None = static(default=None)
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> ShapeNetwork:
         """The network with the given weights; the package's if None."""
+        from mechsearch_jax.networks.weights import shipped_weights
+
         weights = weights or shipped_weights("recognition")
-        return cls(weights.parameters, cast(RecognitionNetwork, weights.network), weights.view)
+        return cls(weights.parameters, cast("RecognitionNetwork", weights.network), weights.view)
 
 
-class LabelledImage(flax.struct.PyTreeNode):
+class LabelledImage(PyTreeNode):
     """An image of points with a label for each pixel.
 
     Attributes:

@@ -18,7 +18,6 @@ import functools
 import math
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +29,7 @@ from mechsearch_jax.geometry.transforms import exponential, make, matmul, rotate
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.perception.scores import EDGE
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -43,7 +43,7 @@ LARGEST_STEP = (0.3,) * 3 + (0.03,) * 3 + (0.3,) * 3
 HALF_EXTENTS = (0.004, 0.3)
 
 
-class Hypothesis(flax.struct.PyTreeNode):
+class Hypothesis(PyTreeNode):
     """A shape class that an object may have; every field may have leading axes."""
 
     exponents: jax.Array
@@ -124,7 +124,7 @@ class RefinementConfig:
         return cls(**{**weak, **sure, **changes})
 
 
-class Refined(flax.struct.PyTreeNode):
+class Refined(PyTreeNode):
     """Refined superquadrics and diagnostics.
 
     Attributes:
@@ -142,7 +142,7 @@ class Refined(flax.struct.PyTreeNode):
     hypothesis: jax.Array
 
 
-class _Shape(flax.struct.PyTreeNode):
+class _Shape(PyTreeNode):
     """The fitted parameters: logarithms of the half-extents, centre and rotation; the exponents are fixed."""
 
     log_size: jax.Array
@@ -151,7 +151,7 @@ class _Shape(flax.struct.PyTreeNode):
     exponents: jax.Array
 
 
-class _Evidence(flax.struct.PyTreeNode):
+class _Evidence(PyTreeNode):
     """The image's evidence about one object: its points, and rays with the depth to which they are free."""
 
     points: jax.Array
@@ -161,7 +161,7 @@ class _Evidence(flax.struct.PyTreeNode):
     ray_weight: jax.Array
 
 
-class _Fit(flax.struct.PyTreeNode):
+class _Fit(PyTreeNode):
     """A shape with the normal equations of its residuals."""
 
     shape: _Shape

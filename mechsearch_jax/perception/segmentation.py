@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
@@ -16,11 +14,17 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.images.cloud import above_board, cloud_of, middle, resample, surfaces
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
-from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
 
+if TYPE_CHECKING:
+    from mechsearch_jax.networks.segmentation import SegmentationNetwork
+    from mechsearch_jax.networks.weights import Weights
+
+# How labels of points are cleaned up: this many nearest points within `REACH` [m] vote on a point's label, itself
+# included, in so many rounds; points of segments of fewer than `LEAST_SEGMENT` points take the label of the nearest
+# other segment. Points without a label within `REACH` become OTHER.
+NEIGHBOURS, ROUNDS, LEAST_SEGMENT, REACH = 9, 1, 8, 0.02
 # Parts of a cloud in which the nearest point is searched for, if they are of equal size.
 _PARTS = 64
 
@@ -45,27 +49,6 @@ class Segmenter(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
-class CleanUpConfig:
-    """How labels of points are cleaned up.
-
-    Attributes:
-      neighbours: number of nearest points within `reach` that vote on a point's label, itself included.
-      rounds: of voting.
-      minimum: points of smaller segments take the label of the nearest other segment.
-      reach: points farther apart do not vote on or take each other's label [m]; points without a label become OTHER.
-    """
-
-    neighbours: int = 9
-    rounds: int = 1
-    minimum: int = 8
-    reach: float = 0.02
-
-    def __post_init__(self):
-        if self.neighbours < 1 or self.rounds < 0 or self.minimum < 0 or self.reach <= 0:
-            raise InputError("CleanUpConfig: neighbours must be at least 1, rounds and minimum 0, reach positive")
-
-
 def _squares(a: Array, b: Array) -> Array:
     """Squared distances between two clouds [m2]."""
     return sum(((a[:, None, i] - b[None, :, i]) ** 2 for i in range(3)), jnp.zeros(()))
@@ -77,23 +60,19 @@ def labels_of(logits: Float[Array, "p classes"]) -> Int[Array, " p"]:
     return jnp.where(best == INSTANCES, OTHER, best).astype(jnp.int8)
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def clean_up(
-    points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"], config: CleanUpConfig | None = None
-) -> Int[Array, " p"]:
+@jax.jit
+def clean_up(points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"]) -> Int[Array, " p"]:
     """Labels after neighbours voted and small segments were merged, int8; OTHER where `valid` is false.
 
     Args:
       points: [m].
       labels: instances' numbers, or OTHER.
       valid: which points exist.
-      config: static.
     """
-    config = config or CleanUpConfig()
     instances = jnp.arange(INSTANCES)
     square = jnp.where(valid[None, :], _squares(points, points), jnp.inf)
-    nearness, nearest = jax.lax.top_k(-square, config.neighbours)
-    votes_count = (-nearness < config.reach**2)[..., None]
+    nearness, nearest = jax.lax.top_k(-square, NEIGHBOURS)
+    votes_count = (-nearness < REACH**2)[..., None]
     member = (labels[:, None] == instances[None, :]) & valid[:, None]
 
     def vote(_, member):
@@ -103,13 +82,13 @@ def clean_up(
         elected = (best[:, None] == instances[None, :]) & (jnp.max(votes, axis=1) > 0)[:, None]
         return elected & member.any(axis=1)[:, None] & valid[:, None]
 
-    member = jax.lax.fori_loop(0, config.rounds, vote, member)
-    kept = jnp.sum(member, axis=0) >= config.minimum
+    member = jax.lax.fori_loop(0, ROUNDS, vote, member)
+    kept = jnp.sum(member, axis=0) >= LEAST_SEGMENT
     lost = member.any(axis=1) & ~(member & kept[None]).any(axis=1)
     stays = (member & kept[None]).any(axis=1)
     distance = jnp.where(stays[None, :], square, jnp.inf)
     source = jnp.argmin(distance, axis=1)
-    near = jnp.min(distance, axis=1) < config.reach**2
+    near = jnp.min(distance, axis=1) < REACH**2
     label = jnp.where(stays, jnp.argmax(member & kept[None], axis=1), OTHER)
     return jnp.where(lost & near, label[source], label).astype(jnp.int8)
 
@@ -165,7 +144,7 @@ def leave_out_smallest(labels: Int[Array, "h w"]) -> Int[Array, "h w"]:
     return jnp.where(labels == smallest, OTHER, rest).astype(jnp.int8)
 
 
-class NetworkSegmenter(flax.struct.PyTreeNode):
+class NetworkSegmenter(PyTreeNode):
     """The `Segmenter` that segments a cloud of the image's points with the segmentation network.
 
     Attributes:
@@ -175,16 +154,20 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
     """
 
     parameters: Any
-    network: SegmentationNetwork = flax.struct.field(pytree_node=False)
-    view: TrainedView | None = flax.struct.field(pytree_node=False, default=None)
+    network: SegmentationNetwork = static()
+    view: TrainedView | None = static(default=None)
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
         """The segmenter with the given weights; the package's if None."""
+        from mechsearch_jax.networks.weights import shipped_weights
+
         weights = weights or shipped_weights("segmentation")
-        return cls(weights.parameters, cast(SegmentationNetwork, weights.network), weights.view)
+        return cls(weights.parameters, cast("SegmentationNetwork", weights.network), weights.view)
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
+        from mechsearch_jax.networks.segmentation import apply_network
+
         objects = above_board(shelf, points) & ~of_target
         surface = surfaces(points, objects).reshape(-1)
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface)

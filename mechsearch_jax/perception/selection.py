@@ -6,7 +6,6 @@ import dataclasses
 import math
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -20,6 +19,7 @@ from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.refinement import FAR
 from mechsearch_jax.perception.solids import entries, penetrations, surface_distance
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -77,7 +77,7 @@ def check_numbers(config: Any, positive: tuple[str, ...]) -> None:
             raise InputError(f"{type(config).__name__}: {field.name} ({value}) must be {least}")
 
 
-class Sample(flax.struct.PyTreeNode):
+class Sample(PyTreeNode):
     """Points and rays that an explanation is judged by.
 
     Attributes:
@@ -100,7 +100,7 @@ class Sample(flax.struct.PyTreeNode):
     free: jax.Array
     exact: jax.Array
     judged: jax.Array
-    ray_weight: float = flax.struct.field(pytree_node=False)
+    ray_weight: float = static()
 
 
 def sample_of(
@@ -144,7 +144,7 @@ def passed(scene: Superquadrics, sample: Sample, costs: Costs) -> Float[Array, "
     return jnp.sum(enter < sample.free[None] - costs.shrink, axis=1) * sample.ray_weight
 
 
-class Moves(flax.struct.PyTreeNode):
+class Moves(PyTreeNode):
     """Changes of an explanation, each from one set of objects to another, shape (Q, C), and which are possible.
 
     The objects are those of the segments, both parts of every division, the unions, and the target.
@@ -185,7 +185,7 @@ def moves_of(
     )
 
 
-class Selection(flax.struct.PyTreeNode):
+class Selection(PyTreeNode):
     """The objects that explain an image at the least cost.
 
     Attributes:

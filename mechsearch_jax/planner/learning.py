@@ -14,7 +14,6 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -149,7 +148,7 @@ def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> Learn
     if not isinstance(trials, LearnsFriction):
         if probabilities:
             raise InputError(
-                "hypotheses were learned, but the trials learn nothing; give the rehearsal that it had, "
+                "hypotheses were learned, but the trials learn nothing; give the trials that it had, "
                 "such as LearningTrials(), or begin a new search"
             )
         return None
@@ -159,7 +158,7 @@ def restored(trials: Trials | None, probabilities: Mapping[str, float]) -> Learn
     if set(probabilities) != set(trials.names):
         raise InputError(
             f"hypotheses {'; '.join(probabilities)} were learned, but the trials have {'; '.join(trials.names)}; give "
-            "the rehearsal that it had, or begin a new search"
+            "the trials that it had, or begin a new search"
         )
     values = np.array([probabilities[name] for name in trials.names])
     if not (np.isfinite(values).all() and (values >= 0.0).all() and values.sum() > 0.0):
@@ -207,6 +206,8 @@ def _misfit(predicted: Float[np.ndarray, "k 3"], seen: Float[np.ndarray, "m 3"],
 
     What comes into sight costs nothing. NaN if a place is NaN.
     """
+    from scipy.optimize import linear_sum_assignment
+
     if np.isnan(predicted).any():
         return math.nan
     there, visible = len(predicted), len(seen)

@@ -12,7 +12,6 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
@@ -38,6 +37,7 @@ from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.compiled import CachedJit, cached_jit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 
 
 class Policy(Protocol):
@@ -85,7 +85,7 @@ class Plan(Protocol):
         ...
 
 
-class PlanningPolicy(flax.struct.PyTreeNode):
+class PlanningPolicy(PyTreeNode):
     """The engine as a `Policy`: takes a found target out as soon as a grasp hits nothing, and otherwise plans.
 
     After trials a grasp that fails there is not made; see `trials.choose`.
@@ -102,11 +102,11 @@ class PlanningPolicy(flax.struct.PyTreeNode):
     """
 
     config: PlannerConfig
-    propose: Propose = flax.struct.field(pytree_node=False)
-    predict: Predict = flax.struct.field(pytree_node=False)
-    objective: Objective = flax.struct.field(pytree_node=False)
-    plan: Plan = flax.struct.field(pytree_node=False, default=plan)
-    tries: bool = flax.struct.field(pytree_node=False, default=False)
+    propose: Propose = static()
+    predict: Predict = static()
+    objective: Objective = static()
+    plan: Plan = static(default=plan)
+    tries: bool = static(default=False)
 
     def rollout(self, problem: Problem, belief: Belief) -> Rollout:
         """The engine with this policy's slots."""

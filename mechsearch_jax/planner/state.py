@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
@@ -12,9 +11,10 @@ from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.existence import ObjectViews
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 
-class State(flax.struct.PyTreeNode):
+class State(PyTreeNode):
     """A predicted state, with quantities computed for the state before it.
 
     Attributes:
@@ -49,7 +49,7 @@ class State(flax.struct.PyTreeNode):
         return (self.available & self.alive)[None] & (kinds[:, None] | ~self.is_target[None])
 
 
-class Sequences(flax.struct.PyTreeNode):
+class Sequences(PyTreeNode):
     """Sampled sequences of actions, best first; leading axis S, and M within.
 
     Attributes:
@@ -69,7 +69,7 @@ class Sequences(flax.struct.PyTreeNode):
     after: Superquadrics
 
 
-class Alternatives(flax.struct.PyTreeNode):
+class Alternatives(PyTreeNode):
     """Alternative actions of a decision, for trials to choose from, best first; K of them.
 
     Attributes:
@@ -88,7 +88,7 @@ class Alternatives(flax.struct.PyTreeNode):
     reached: jax.Array
 
 
-class Decision(flax.struct.PyTreeNode):
+class Decision(PyTreeNode):
     """The next action, and everything that was considered.
 
     Attributes:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +23,13 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, TriedActions, TwoStagePolicy, choose, nothing_tried, scenes_of, tried
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Decisions that are drawn in one step, until one can be executed.
 DRAWS = 4
 
 
-class SearchState(flax.struct.PyTreeNode):
+class SearchState(PyTreeNode):
     """What a search knows between two looks.
 
     Attributes:

@@ -11,7 +11,6 @@ import functools
 import math
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +25,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.state import Alternatives, Decision, Sequences
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Largest number of first actions of sequences that are tried; for grasps see `retrieval.TRIES`.
 TRIES = 8
@@ -52,7 +52,7 @@ class TrialResult(enum.IntEnum):
     UNSURE = 4
 
 
-class TrialScenes(flax.struct.PyTreeNode):
+class TrialScenes(PyTreeNode):
     """Scenes in which actions are tried; every field has a leading axis R.
 
     Attributes:

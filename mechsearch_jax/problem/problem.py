@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
-import flax.struct
 import jax
 import numpy as np
 
@@ -19,6 +18,7 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.cores import on_host
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
@@ -28,7 +28,7 @@ from mechsearch_jax.workspace.target import Target
 NOWHERE = "shelf: the arm reaches the target nowhere; check the shelf's place before the robot"
 
 
-class Problem(flax.struct.PyTreeNode):
+class Problem(PyTreeNode):
     """The constants of an episode: everything but the objects, and the tables that follow from it.
 
     Attributes:
@@ -49,9 +49,9 @@ class Problem(flax.struct.PyTreeNode):
     cell: jax.Array
     camera: Camera
     shelf: Shelf
-    gripper: Gripper = flax.struct.field(pytree_node=False)
+    gripper: Gripper = static()
     target: Target
-    config: ProblemConfig = flax.struct.field(pytree_node=False)
+    config: ProblemConfig = static()
 
     @property
     def space(self) -> ActionSpace:

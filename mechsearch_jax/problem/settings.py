@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
-from mechsearch_jax.config.config import OPTIONS, Config, Option
+from mechsearch_jax.config.config import OPTIONS, Config
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
@@ -77,7 +77,7 @@ class Settings:
 
 
 # The keys of the target's table that are the workcell's `colour` and `hue_tolerance`; all others are of the `Target`.
-COLOR, HUE_TOLERANCE = "color", "hue_tolerance"
+COLOUR, HUE_TOLERANCE = "colour", "hue_tolerance"
 
 # The defaults of a file's tables, without the planner's.
 _PARTS: Mapping[str, Any] = {
@@ -103,14 +103,15 @@ def tables() -> dict[str, dict[str, Any]]:
     }
     parts["target"].pop("compound")
     parts["gripper"].pop("arm")
-    parts["target"] |= _MADE_OF | {COLOR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
+    parts["target"] |= _MADE_OF | {COLOUR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
 
 def load_settings(path: PathLike) -> Settings:
     """Read a configuration file (TOML); missing keys take their defaults.
 
-    Lengths in metres, angles in radians, poses in the robot's base frame, or in a frame in which `[base]` locates it.
+    Lengths in metres, angles in degrees but the joints' in radians, poses in the robot's base frame, or in a frame in
+    which `[base]` locates it.
 
     Raises:
       InputError: the file cannot be read or is not TOML; a table or key is unknown; a value is of the wrong type or
@@ -167,16 +168,16 @@ def _with_moved_place(document: Document, offset: tuple[float, float, float]) ->
 def _detector(document: Document) -> tuple[dict[str, Any], Document]:
     """What the workcell holds of the target's colour, and the document without it."""
     table = document.tables.get("target", {})
-    if "colour" in table:
-        raise InputError(f"{document.where('target', 'colour')} is unknown; did you mean {COLOR}?")
+    if "color" in table:
+        raise InputError(f"{document.where('target', 'color')} is called {COLOUR} now")
     given: dict[str, Any] = {}
-    if COLOR in table:
-        given[COLOR] = _rgb(document, table[COLOR])
+    if COLOUR in table:
+        given[COLOUR] = _rgb(document, table[COLOUR])
     if HUE_TOLERANCE in table:
         given[HUE_TOLERANCE] = checked(table[HUE_TOLERANCE], float, document.where("target", HUE_TOLERANCE))
-    lit = lambda values: TargetColour.lit(values.get(COLOR, RED), values.get(HUE_TOLERANCE, HUE))  # noqa: E731
+    lit = lambda values: TargetColour.lit(values.get(COLOUR, RED), values.get(HUE_TOLERANCE, HUE))  # noqa: E731
     apply(document, "target", given, lit)
-    names = {COLOR: "colour", HUE_TOLERANCE: "hue_tolerance"}
+    names = {COLOUR: "colour", HUE_TOLERANCE: "hue_tolerance"}
     rest = {key: value for key, value in table.items() if key not in names}
     without = dataclasses.replace(document, tables={**document.tables, "target": rest})
     return {names[key]: value for key, value in given.items()}, without
@@ -184,7 +185,7 @@ def _detector(document: Document) -> tuple[dict[str, Any], Document]:
 
 def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
     """The target's colour, given as red, green and blue, or as a table of hue and saturation."""
-    where = document.where("target", COLOR)
+    where = document.where("target", COLOUR)
     if not isinstance(value, dict):
         return checked(value, tuple[float, float, float], where)
     if value.keys() != {"hue", "saturation"}:
@@ -196,7 +197,7 @@ def _rgb(document: Document, value: Any) -> tuple[float, float, float]:
             f"{LEAST_TARGET_SATURATION:g}, or a mask with the images"
         )
     return apply(
-        document, "target", {COLOR: (hue, saturation)}, lambda numbers: rgb_of_hue(*numbers.get(COLOR, (0.0, 1.0)))
+        document, "target", {COLOUR: (hue, saturation)}, lambda numbers: rgb_of_hue(*numbers.get(COLOUR, (0.0, 1.0)))
     )
 
 
@@ -232,7 +233,7 @@ def _compound_target(document: Document, made_of: dict[str, Any]) -> Target:
 
 def _with_planner(document: Document, settings: Settings) -> Settings:
     """The settings with the planner's table."""
-    types = {option.name: _type(option) for option in OPTIONS}
+    types = {option.name: option.values for option in OPTIONS}
     for key in document.tables.get(PLANNER, {}):
         if fixed := refusal(key):
             raise InputError(f"{document.where(PLANNER, key)}: {fixed}")
@@ -240,11 +241,13 @@ def _with_planner(document: Document, settings: Settings) -> Settings:
     table = dict(document.tables.get(PLANNER, {}))
     preset = checked(table.pop("preset", DEFAULT_PRESET), Literal[tuple(PRESETS)], document.where(PLANNER, "preset"))
     given = {name: checked(value, types[name], document.where(PLANNER, name)) for name, value in table.items()}
-    return apply(document, PLANNER, given, lambda options: settings.with_options(preset, **options))
-
-
-def _type(option: Option) -> Any:
-    return Literal[option.choices] if option.choices else option.type
+    inside = {option.name: option.inside for option in OPTIONS}
+    return apply(
+        document,
+        PLANNER,
+        given,
+        lambda options: settings.with_options(preset, **{name: inside[name](value) for name, value in options.items()}),
+    )
 
 
 def example_config() -> str:

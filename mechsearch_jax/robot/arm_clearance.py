@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import HAND, LINKS, RobotPart, fingers
+from mechsearch_jax.robot.gripper import RobotPart, fingers, hand_parts, link_parts
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Edge of the cells into which boxes are divided, with a sphere around each [m]. Coarse cells are for self-collisions,
@@ -76,7 +76,12 @@ class ArmBody:
     def of(cls, opening: float, held: Held | None = None) -> ArmBody:
         """The arm with `opening` m between the fingers."""
         extra = ((HAND_FRAME, _in_hand(held)),) if held else ()
-        bodies = (*((i, LINKS[i]) for i in range(7)), (HAND_FRAME, HAND), (HAND_FRAME, fingers(opening)), *extra)
+        bodies = (
+            *((i, link_parts()[i]) for i in range(7)),
+            (HAND_FRAME, hand_parts()),
+            (HAND_FRAME, fingers(opening)),
+            *extra,
+        )
         return cls(_spheres(bodies, CELL), _spheres(bodies[5:], COARSE_CELL))
 
 
@@ -220,7 +225,7 @@ def _base_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
     start, end, radius = FOOT
     capsules = [(-1, np.array(start, np.float32), np.array(end, np.float32), radius)]
     for frame in (0, 1):
-        for capsule in LINKS[frame]:
+        for capsule in link_parts()[frame]:
             T, (radius, half) = capsule.T_frame_primitive, capsule.size
             first, last = ((T[:3, 3] + sign * half * T[:3, 2]).astype(np.float32) for sign in (-1.0, 1.0))
             capsules.append((frame, first, last, radius))

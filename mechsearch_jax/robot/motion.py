@@ -12,12 +12,10 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.robot.arm_config import PANDA, Arm
@@ -26,6 +24,7 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Least time steps of a stretch: rounding errors must not decide its duration where the hand hardly moves.
 SHORTEST = 25
@@ -96,7 +95,7 @@ def motion_with(gripper: Gripper, config: MotionConfig | None) -> MotionConfig:
     return dataclasses.replace(config, gripper=dataclasses.replace(config.gripper, arm=gripper.arm))
 
 
-class Reference(flax.struct.PyTreeNode):
+class Reference(PyTreeNode):
     """What the controller follows, one row for each time step. The last row is repeated when the motion is over.
 
     Attributes:
@@ -153,6 +152,8 @@ def _points(q: Array, stretch: _Stretch, count: int) -> Array:
 @functools.cache
 def _respaced(given: int, count: int) -> np.ndarray:
     """The matrix that resamples the natural spline through `given` points at `count` evenly spaced points."""
+    from scipy.interpolate import CubicSpline
+
     spline = CubicSpline(np.arange(given), np.eye(given), bc_type="natural")
     return spline(np.linspace(0, given - 1, count)).astype(np.float32)
 

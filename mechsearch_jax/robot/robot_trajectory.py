@@ -10,7 +10,6 @@ from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.hand import HandEvent
@@ -183,6 +182,8 @@ def derivatives(
     velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
     for first, last in itertools.pairwise(sorted({0, *rests, len(position) - 1})):
         rows = slice(first, last + 1)
+        from scipy.interpolate import CubicSpline
+
         spline = CubicSpline(np.arange(last + 1 - first) * timestep, position[rows], bc_type="clamped")
         velocity[rows], acceleration[rows] = spline(spline.x, 1), spline(spline.x, 2)
         velocity[[first, last]] = acceleration[[first, last]] = 0.0
@@ -198,6 +199,8 @@ def slowed(position: Float[np.ndarray, "t 7"], factor: float) -> Float[np.ndarra
     """
     if len(position) < 2:
         return position
+    from scipy.interpolate import CubicSpline
+
     spline = CubicSpline(np.arange(len(position)), position, bc_type="clamped")
     rows = math.ceil((len(position) - 1) * factor - 1e-9) + 1
     return spline(np.linspace(0.0, len(position) - 1, rows))

@@ -14,14 +14,13 @@ the derivatives, so sampling raises no peak.
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.robot.arm_config import PANDA, Arm
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Candidate shares of a stretch's time in which its speed rises, and falls. Short ramps suit long stretches, which
 # velocities limit; the first of equally fast ones is chosen, which is closest to 3 u^2 - 2 u^3.
@@ -35,7 +34,7 @@ LEAST_SHARE = 0.5
 SMOOTHINGS = 4
 
 
-class Curve(flax.struct.PyTreeNode):
+class Curve(PyTreeNode):
     """A natural cubic spline through joint angles.
 
     Attributes:
@@ -132,6 +131,8 @@ def travelled(curve: Curve, ramp: int, steps: int) -> Float[np.ndarray, "{steps}
     """
     share = _profile(np.arange(1, steps + 1) / steps, RAMPS[ramp])
     knots = np.asarray(curve.knots, float)
+    from scipy.interpolate import CubicSpline
+
     spline = CubicSpline(knots / knots[-1], np.asarray(curve.q, float), bc_type="natural")
     return spline(np.clip(share, 0.0, 1.0))
 

@@ -38,6 +38,23 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     return f"did you mean {alike[0]}?" if alike else f"known are {', '.join(names)}"
 
 
+def check_once(what: str, names: Iterable[str]) -> None:
+    """Check that no name is given twice, as the results of both could not be told apart.
+
+    Args:
+      what: is named, as "lab looks: two scenes".
+      names: of all.
+
+    Raises:
+      InputError: a name is there twice.
+    """
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InputError(f"{what} are called {name}; rename one")
+        seen.add(name)
+
+
 def check_range(name: str, value: float | int, low: float | int, high: float | int, unit: str = "") -> None:
     """Check that a number is from `low` to `high`.
 

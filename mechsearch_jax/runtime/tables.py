@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from mechsearch_jax.runtime.errors import InputError, nearest, shown
 from mechsearch_jax.runtime.files import PathLike, read_text
+from mechsearch_jax.runtime.options import DEGREES, in_radians
 
 # Largest size of a settings file [bytes].
 LIMIT = 2**18
@@ -157,7 +158,15 @@ def with_table(document: Document, table: str, usual: T) -> T:
         key: checked(value, hints[key], document.where(table, key))
         for key, value in document.tables.get(table, {}).items()
     }
-    return apply(document, table, given, lambda changes: dataclasses.replace(defaults, **changes))
+    least = {field.name: field.metadata.get(DEGREES) for field in dataclasses.fields(kind)}
+    return apply(
+        document,
+        table,
+        given,
+        lambda changes: dataclasses.replace(
+            defaults, **{key: in_radians(key, value, least[key]) for key, value in changes.items()}
+        ),
+    )
 
 
 def apply(document: Document, table: str, given: Mapping[str, Any], make: Callable[[Mapping[str, Any]], T]) -> T:

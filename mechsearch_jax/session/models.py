@@ -13,8 +13,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 # The notice where no action is tried in physics.
 UNTRIED = (
-    "rehearsal: no action is tried out before it is made, so that less is found and retrieved than the results say; "
-    'leave out rehearsal="none", or make the policy with tries=True'
+    "trials: no action is tried out before it is made, so that less is found and retrieved than the results say; "
+    'leave out trials="none", or make the policy with tries=True'
 )
 
 
@@ -41,10 +41,10 @@ def policy_and_trials(
     """
     models = {"push_model": push_model, "later_push_model": later_push_model}
     given = [name for name, model in models.items() if model is not None]
-    if config.rehearsal == "learning" and trials is not None and not isinstance(trials, LearnsFriction):
+    if config.trials == "learning" and trials is not None and not isinstance(trials, LearnsFriction):
         raise InputError(
-            'Searcher: config names the rehearsal "learning", and one that learns nothing is given; give '
-            'rehearsal=LearningTrials() (envs.trials.learning), or a config with rehearsal="physics"'
+            'Searcher: config names the trials "learning", and others that learn nothing are given; give '
+            'trials=LearningTrials() (envs.trials.learning), or a config with trials="physics"'
         )
     if policy is not None:
         if given:
@@ -54,13 +54,13 @@ def policy_and_trials(
             )
         if trials is not None and isinstance(policy, PlanningPolicy) and not policy.tries:
             raise InputError(
-                "Searcher: rehearsal would have no effect, for the policy proposes nothing to be tried; make it with "
+                "Searcher: trials would have no effect, for the policy proposes nothing to be tried; make it with "
                 "tries=True"
             )
         proposes = isinstance(policy, PlanningPolicy) and policy.tries
-        return policy, simulated.trials(config.rehearsal) if trials is None and proposes else trials
+        return policy, simulated.trials(config.trials) if trials is None and proposes else trials
     if trials is None:
-        trials = simulated.trials(config.rehearsal)
+        trials = simulated.trials(config.trials)
     if push_model is None:
         push_model, later = simulated.push_models(config.push_model, shelf)
         later_push_model = later if later_push_model is None else later_push_model

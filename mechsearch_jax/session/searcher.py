@@ -51,8 +51,7 @@ from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
 from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
-from mechsearch_jax.session.step import Motion, Present, SearchStep, display_image, motion_of
-from mechsearch_jax.session.view import View
+from mechsearch_jax.session.step import Motion, Present, SearchStep, View, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.sight import check_camera
 
@@ -91,7 +90,7 @@ class Searcher:
         policy: Policy | None = None,
         push_model: PushModel | None = None,
         later_push_model: PushModel | None = None,
-        rehearsal: Trials | None = None,
+        trials: Trials | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
         trajectories: TrajectoryConfig | None = None,
         view: View | None = None,
@@ -107,7 +106,7 @@ class Searcher:
             configuration and push models.
           push_model, later_push_model: predict pushes, the latter those after the first action of a sequence; by
             default the one that `config` names.
-          rehearsal: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`; by
+          trials: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`; by
             default what `config` names. With "none", the target is only taken out where nothing is touched; `check`
             and each step's reason say so.
           recogniser: makes a recogniser of a problem; it is called like `Recogniser`.
@@ -125,7 +124,7 @@ class Searcher:
         self.config = config or standard()
         self._seed = seed
         self._policy, self._trials = policy_and_trials(
-            self.config, self.workcell.shelf, policy, rehearsal, push_model, later_push_model
+            self.config, self.workcell.shelf, policy, trials, push_model, later_push_model
         )
         self._make_recogniser = recogniser
         self._trajectories = trajectories

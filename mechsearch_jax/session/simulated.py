@@ -12,14 +12,14 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 def trials(name: str) -> Trials | None:
-    """The trials of a rehearsal's name; None for "none".
+    """The trials of a name; None for "none".
 
     Raises:
-      InputError: there is no rehearsal of that name.
+      InputError: there is nothing of that name.
     """
-    from mechsearch_jax.envs.trials.named import rehearsal
+    from mechsearch_jax.envs.trials.named import named_trials
 
-    return rehearsal(name)
+    return named_trials(name)
 
 
 def push_models(name: str, shelf: Shelf) -> tuple[PushModel, PushModel]:

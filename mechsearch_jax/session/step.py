@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.planner.trials import TriedActions
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
@@ -26,11 +27,37 @@ from mechsearch_jax.session.step_json import step_json
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.workspace.camera import measured
 
-# Drawing takes as long to import as a third of all else; who draws nothing does not wait for it.
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mechsearch_jax.viz.filmstrip import Frame
+
+
+class View(Protocol):
+    """Shows a search while it runs, such as `envs.viewer.live.LiveView`.
+
+    It is called in the thread of the search, which goes on when the call returns; what takes long belongs into another
+    thread. It changes nothing of the search.
+    """
+
+    def decided(self, step: SearchStep, tried: TriedActions) -> None:
+        """Show a step.
+
+        Args:
+          step: what `next` is about to return.
+          tried: what trials came to before that decision; nothing without trials.
+        """
+        ...
+
+    def acted(self, step: SearchStep, ok: bool) -> None:
+        """Show that the motion of a step is over.
+
+        Args:
+          step: the last one that was shown.
+          ok: the argument of `acted`.
+        """
+        ...
+
 
 # Why no motion is made that would sweep space in which something may stand that has no depth.
 UNMEASURED = (

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
@@ -66,6 +65,8 @@ def _objects(step: SearchStep) -> list[dict[str, Any]]:
 
     Bodies of several parts have `parts`, in their own frames, and `size` and `exponents` of what bounds these.
     """
+    from scipy.spatial.transform import Rotation
+
     scene, confidence = step.observation.objects, np.asarray(step.observation.judged().confidence)
     return [
         {

@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.shapes.primitives import PRIMITIVES
 
@@ -65,6 +63,8 @@ class Piece:
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """`R_body_piece`."""
+        from scipy.spatial.transform import Rotation
+
         return Rotation.from_quat(self.quaternion, scalar_first=True).as_matrix()
 
     def in_body(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -152,6 +152,8 @@ def hull(piece: Piece) -> trimesh.Trimesh:
 
 def hull_volume(points: Float[np.ndarray, "n 3"]) -> float:
     """Volume of the convex hull of points [m3]; 0 where they are in a plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         return float(ConvexHull(points).volume)
     except (QhullError, ValueError):
@@ -168,6 +170,8 @@ def mesh(piece: Piece) -> trimesh.Trimesh:
 
 def faces(piece: Piece) -> Float[np.ndarray, "n 4"]:
     """The half-spaces n . x <= d of a convex polyhedron in its own frame, as rows (n, d)."""
+    from scipy.spatial import ConvexHull
+
     rows = np.unique(np.round(ConvexHull(np.array(piece.vertices)).equations, 9), axis=0)
     return np.column_stack([rows[:, :3], -rows[:, 3]])
 

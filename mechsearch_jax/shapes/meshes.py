@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, KDTree
 
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.runtime.kept_arrays import kept_arrays
@@ -212,6 +211,8 @@ def _cut(part: Trimesh, path: Path, where: str) -> list[Float[np.ndarray, "_ 3"]
 def joined(hulls: Sequence[Float[np.ndarray, "_ 3"]], most: int = MOST_SOLIDS) -> list[Float[np.ndarray, "_ 3"]]:
     """At most so many convex polyhedra, by their vertices: always the two neighbours are joined whose hull holds least
     that neither holds."""
+    from scipy.spatial import KDTree
+
     left = {i: thinned(_corners(vertices)) for i, vertices in enumerate(hulls)}
     volumes = {i: hull_volume(vertices) for i, vertices in left.items()}
     gains: dict[tuple[int, int], float] = {}
@@ -238,6 +239,8 @@ def _true_to_size(corners: Float[np.ndarray, "n 3"], part: Trimesh) -> Float[np.
 
 def _corners(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Those of the convex hull."""
+    from scipy.spatial import ConvexHull
+
     return vertices[ConvexHull(vertices).vertices]
 
 

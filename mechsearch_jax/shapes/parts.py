@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull
 
 from mechsearch_jax.shapes.compound import FRUSTUM, Compound, Piece, discs, inside, mesh, solids
 from mechsearch_jax.shapes.primitives import SHAPES
@@ -145,6 +144,8 @@ def _clusters(pieces: Sequence[Piece]) -> list[list[Piece]]:
         return np.concatenate([np.asarray(mesh(solid).vertices) for solid in solids(group)])
 
     def volume(group: list[Piece]) -> float:
+        from scipy.spatial import ConvexHull
+
         return float(ConvexHull(corners(group)).volume)
 
     while len(groups) > PARTS:

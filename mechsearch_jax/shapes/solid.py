@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, mesh, solids
@@ -153,6 +152,8 @@ def _shrunk(solid: Piece, erosion: float) -> trimesh.Trimesh:
 @functools.lru_cache(maxsize=256)
 def _rim(compound: Compound) -> Float[np.ndarray, "corners 2"]:
     """The polygon whose sides touch the solid in evenly spread directions."""
+    from scipy.spatial import ConvexHull
+
     count = 72
     angle = np.arange(count) * (2 * math.pi / count)
     normal = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)

@@ -11,9 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, KDTree
 
 from mechsearch_jax.shapes.compound import hull_volume
 
@@ -61,6 +58,7 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.n
     be nearer.
     """
     import trimesh
+    from scipy.spatial import KDTree
 
     samples, face = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[:2]
     # Small triangles may have no sample.
@@ -107,6 +105,8 @@ def beyond(hulls: Sequence[Float[np.ndarray, "_ 3"]], points: Float[np.ndarray, 
 
     That is the distance to the plane of a face: before an edge or a corner it is less than the true one.
     """
+    from scipy.spatial import ConvexHull
+
     planes = [ConvexHull(vertices).equations for vertices in hulls]
     return np.clip(np.min([np.max(points @ p[:, :3].T + p[:, 3], axis=1) for p in planes], axis=0), 0.0, None)
 
@@ -176,6 +176,8 @@ def open_edges(mesh: Trimesh) -> Int[np.ndarray, "n 2"]:
 
 def _welded(mesh: Trimesh) -> Trimesh:
     """The mesh without seams: other vertices than those of open edges stay, however near to each other."""
+    from scipy.spatial import KDTree
+
     border = np.unique(open_edges(mesh))
     if len(border):
         pairs = border[KDTree(mesh.vertices[border]).query_pairs(SEAM, output_type="ndarray")]
@@ -191,6 +193,9 @@ def _welded(mesh: Trimesh) -> Trimesh:
 
 
 def _components(pairs: Int[np.ndarray, "n 2"], count: int) -> Int[np.ndarray, " count"]:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(graph, directed=False)[1]
 

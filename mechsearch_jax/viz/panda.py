@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.robot.arm_clearance import FOOT
-from mechsearch_jax.robot.gripper import HAND, LINKS, RobotPart, fingers
+from mechsearch_jax.robot.gripper import RobotPart, fingers, hand_parts, link_parts
 from mechsearch_jax.shapes import Capsule, shape_of
 from mechsearch_jax.viz.raycast import Colour, VisibleSolid
 
@@ -45,8 +45,8 @@ def _parts(opening: float) -> list[tuple[int, tuple[RobotPart, ...], Colour]]:
     """The frame, the primitives and the colour of each link, of the hand and of its fingers."""
     both = fingers(opening)
     half = len(both) // 2
-    links = [(i, tuple(link), colour) for i, (link, colour) in enumerate(zip(LINKS, COLOURS, strict=True))]
-    return [*links, (7, tuple(HAND), DARK), (7, both[:half], GREY), (7, both[half:], GREY)]
+    links = [(i, tuple(link), colour) for i, (link, colour) in enumerate(zip(link_parts(), COLOURS, strict=True))]
+    return [*links, (7, tuple(hand_parts()), DARK), (7, both[:half], GREY), (7, both[half:], GREY)]
 
 
 def _foot() -> VisibleSolid:

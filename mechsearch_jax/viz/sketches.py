@@ -15,7 +15,7 @@ from matplotlib.path import Path
 
 from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.robot.gripper import HAND, RobotPart, fingers
+from mechsearch_jax.robot.gripper import RobotPart, fingers, hand_parts
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
@@ -106,7 +106,7 @@ def points_of_hand(T: Float[np.ndarray, "4 4"], opening: float) -> list[Float[np
     """`hand_points` from the pose of the hand."""
     both = fingers(opening)
     half = len(both) // 2
-    return [_corners(T, parts) for parts in (both[:half], both[half:], HAND)]
+    return [_corners(T, parts) for parts in (both[:half], both[half:], hand_parts())]
 
 
 def _corners(T: np.ndarray, parts: Sequence[RobotPart]) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -14,6 +13,7 @@ from mechsearch_jax.geometry.bodies import placed_parts, world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, rotate, transform
 from mechsearch_jax.runtime.own_settings import in_own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 
 NEWTON_STEPS = 8
@@ -98,7 +98,7 @@ def render_depth(camera: Camera, scene: Superquadrics) -> Float[Array, "h w"]:
     return jnp.min(depths, axis=0)
 
 
-class Window(flax.struct.PyTreeNode):
+class Window(PyTreeNode):
     """One object's image: the depth at every `stride`-th pixel of a part of the camera's image.
 
     Attributes:

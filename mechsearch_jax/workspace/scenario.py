@@ -16,7 +16,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import bodies_of
@@ -307,6 +306,8 @@ def _plain(value: Any) -> Any:
 
 def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z), which are normalised first; at most one leading axis."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_quat(np.roll(np.asarray(quaternion, float), -1, axis=-1)).as_matrix()
 
 

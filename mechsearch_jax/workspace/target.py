@@ -10,19 +10,18 @@ import os
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.runtime.files import PathLike, read_json
 from mechsearch_jax.runtime.identity import Uncompared
+from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.shapes import shape_of, union
 from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, half_extents, solids
 from mechsearch_jax.shapes.meshes import LEAST_THICKNESS, thickness
@@ -30,6 +29,9 @@ from mechsearch_jax.shapes.parts import part_rows
 from mechsearch_jax.shapes.solid import Solid, solid_of
 from mechsearch_jax.workspace.scenario import Body, check_norm, format_compound, is_compound, numbers, parse_compound
 from mechsearch_jax.workspace.shelf import Shelf
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 # The number of planes of all polyhedra is rounded up to a multiple of this, and is at least so large: that of eight
 # polyhedra of 48 vertices.
@@ -45,7 +47,7 @@ DENSITY, FRICTION = 600.0, 0.5
 TURN = "quaternion"
 
 
-class TargetData(flax.struct.PyTreeNode):
+class TargetData(PyTreeNode):
     """The geometry of a target of pieces, in the frame of its centre of mass.
 
     Attributes:
@@ -73,9 +75,9 @@ class TargetData(flax.struct.PyTreeNode):
     radius: Any
     parts: tuple[Any, ...]
     number: Any
-    turn: float = flax.struct.field(pytree_node=False)
-    round: bool = flax.struct.field(pytree_node=False)
-    primitives: tuple[Piece, ...] = flax.struct.field(pytree_node=False)
+    turn: float = static()
+    round: bool = static()
+    primitives: tuple[Piece, ...] = static()
 
     def is_of(self, compound: Compound | None) -> bool:
         """Whether these are the arrays of a compound; False inside of a program."""
@@ -472,6 +474,8 @@ def load_target(path: PathLike, scale: float = 1.0) -> Target:
     Raises:
       InputError: the file cannot be read, holds something else, or no target can be made of it.
     """
+    from scipy.spatial.transform import Rotation
+
     file = Path(path)
     if file.suffix.lower() != ".json":
         return Target.from_mesh(file, scale)
@@ -493,6 +497,8 @@ def load_target(path: PathLike, scale: float = 1.0) -> Target:
 
 def _turned(piece: Piece, turn: Rotation) -> Piece:
     """A piece in a frame that is turned about the body's origin; a polyhedron has no rotation of its own."""
+    from scipy.spatial.transform import Rotation
+
     if turn.magnitude() == 0.0:
         return piece
     moved = dataclasses.replace(piece, position=_rounded(turn.apply(piece.position)))

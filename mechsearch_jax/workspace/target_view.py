@@ -8,14 +8,12 @@ its own images and points are those of its exact pieces: they decide where it ca
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from jaxtyping import Array, Bool, Float
-from scipy.spatial import ConvexHull
 
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import placed_parts
@@ -25,6 +23,9 @@ from mechsearch_jax.shapes import solid
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, pixel_rays
 from mechsearch_jax.workspace.target import Target
+
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
 
 # Arrays of JAX or NumPy.
 Numbers = Any
@@ -152,6 +153,9 @@ def surface_cloud(target: Target, count: int) -> Float[np.ndarray, "n 3"]:
 
 def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
     """Surface of the volume that the target sweeps along a direction, in its own frame, shape (count, 3) [m]."""
+    import trimesh
+    from scipy.spatial import ConvexHull
+
     way = distance * np.asarray(direction)
     if target.compound is None:
         (mesh,) = target.solid.hulls(erosion)
@@ -176,6 +180,8 @@ def _corners(target: Target, erosion: float) -> tuple[Float[np.ndarray, "n 3"], 
 
 def _drawn(hull: ConvexHull, count: int, seed: int) -> Float[np.ndarray, "{count} 3"]:
     """Points on the surface of a convex hull [m]."""
+    import trimesh
+
     # Much faster than `trimesh.convex.convex_hull`, whose faces all turn the same way, which does not count here.
     surface = trimesh.Trimesh(hull.points, hull.simplices, process=False)
     return np.asarray(trimesh.sample.sample_surface(surface, count, seed=seed)[0])

@@ -60,7 +60,7 @@ def scenario_files():
 # --- what is computed ------------------------------------------------------------------------------------------------
 
 
-def run_episode(path, method, recognition, rehearsal="physics", seed=0):
+def run_episode(path, method, recognition, trials="physics", seed=0):
     from mechsearch_jax.envs.camera.recognisers import recogniser
     from mechsearch_jax.envs.episode import episodes
     from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
@@ -72,20 +72,20 @@ def run_episode(path, method, recognition, rehearsal="physics", seed=0):
 
     scenario = load_scenario(path)
     target = episodes.target_of(scenario)
-    chosen = Method(method, PRESETS["standard"](rehearsal=rehearsal), recognition)
+    chosen = Method(method, PRESETS["standard"](trials=trials), recognition)
     see = recogniser(recognition, target)
     simulator = NativeSimulator(threads=1)
     settings = RunSettings(see, options=chosen.options(), trials=chosen.trials())
     return episodes.run_episode(Start(scenario, seed), cached_problem(target), chosen.policy(), simulator, settings)
 
 
-def episode_answer(path, method, recognition, rehearsal):
-    episode = run_episode(path, method, recognition, rehearsal)
+def episode_answer(path, method, recognition, trials):
+    episode = run_episode(path, method, recognition, trials)
     value = dataclasses.asdict(episode)
     for step in value["steps"]:
         del step["timings"]
     names = ("scenario", "objects", "found_step", "graspable_step", "retrieved", "failure", "steps")
-    return {name: value[name] for name in names} | {"rehearsal": episode.config["rehearsal"]}
+    return {name: value[name] for name in names} | {"trials": episode.config["trials"]}
 
 
 def answers_of(share):
@@ -93,21 +93,21 @@ def answers_of(share):
 
     keep_compilations()
     answers = {}
-    for path, method, recognition, rehearsal in share:
-        name = f"{Path(path).stem} {method} {recognition}, rehearsal {rehearsal}"
-        answers[name] = episode_answer(path, method, recognition, rehearsal)
+    for path, method, recognition, trials in share:
+        name = f"{Path(path).stem} {method} {recognition}, trials {trials}"
+        answers[name] = episode_answer(path, method, recognition, trials)
         print(".", end="", flush=True)
     return answers
 
 
 def episode_jobs():
-    """The file, method, recognition and rehearsal of each episode."""
+    """The file, method, recognition and trials of each episode."""
     files = [str(file) for file in scenario_files()]
     return [(file, *setting) for setting in SETTINGS for file in files]
 
 
 def episodes():
-    """By scenario, method, recognition and rehearsal; in two processes."""
+    """By scenario, method, recognition and trials; in two processes."""
     jobs, answers = episode_jobs(), {}
     with concurrent.futures.ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         # Half of the recognitions' jobs each: the one's episodes with masks take as long as the other's.

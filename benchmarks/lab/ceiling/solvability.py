@@ -27,7 +27,7 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.planner import PRESETS, Config, planning_policy
 from mechsearch_jax.problem.cache import cached_problem
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, save_json
+from mechsearch_jax.runtime.files import PathLike, read_json, save_json
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.viz.drawing import save_figure
 from mechsearch_jax.workspace.scenario import Scenario
@@ -109,12 +109,7 @@ def _evaluated(path: PathLike) -> Iterator[tuple[str, str | None, bool]]:
 
 def _stored(file: PathLike) -> Iterator[tuple[str, str | None, bool]]:
     """As `_evaluated`, of a stored result: its "runs" have "episodes", each an object, or a list by "columns"."""
-    try:
-        value = json.loads(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error
-    except ValueError as error:
-        raise InputError(f"{file}: is not JSON ({' '.join(str(error).split())})") from error
+    value = read_json(file)
     runs = value.get("runs") if isinstance(value, dict) else None
     try:
         for run in runs or ():

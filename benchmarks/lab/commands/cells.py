@@ -31,7 +31,7 @@ def bench_reach(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.reach.reach import reach, save_reach
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import reach_table
+    from mechsearch_jax.benchmarks.lab.tables import reach_table
     from mechsearch_jax.problem.cache import keep_compilations
 
     settings = options.settings()
@@ -66,7 +66,7 @@ def bench_calibration(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.calibration.offsets import CalibrationBench
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import calibration_table
+    from mechsearch_jax.benchmarks.lab.tables import calibration_table
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.workspace.scenario import load_scenario
 

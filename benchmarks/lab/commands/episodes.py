@@ -13,7 +13,7 @@ import tyro
 
 from mechsearch_jax.benchmarks.lab import PROGRAM
 from mechsearch_jax.commands.options import SomeScenarios, at_least_one, find_scenarios
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_once
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.known_target.search import Node
@@ -35,12 +35,9 @@ def _scenes(command: str, names: Sequence[str]) -> list[Scenario]:
     """
     from mechsearch_jax.workspace.scenario import load_scenario
 
-    scenes: dict[str, Scenario] = {}
-    for scene in map(load_scenario, find_scenarios(names)):
-        if scene.name in scenes:
-            raise InputError(f"lab {command}: two scenes are called {scene.name}; rename one")
-        scenes[scene.name] = scene
-    return list(scenes.values())
+    scenes = list(map(load_scenario, find_scenarios(names)))
+    check_once(f"lab {command}: two scenes", (scene.name for scene in scenes))
+    return scenes
 
 
 def _nearest(best: Node) -> str:
@@ -92,7 +89,7 @@ def bench_ceiling(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.ceiling import solvability
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import ceiling_table
+    from mechsearch_jax.benchmarks.lab.tables import ceiling_table
     from mechsearch_jax.envs.known_target.search import KnownSearchConfig
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
@@ -130,8 +127,8 @@ def bench_cell(
     objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (2, 4, 6),
     searches: int = 20,
     seed: int = 0,
-    colors: Annotated[tuple[tuple[float, float, float], ...], tyro.conf.arg(metavar="R G B ...")] = (),
-    color_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SHARE ...")] = (4 / 255,),
+    colours: Annotated[tuple[tuple[float, float, float], ...], tyro.conf.arg(metavar="R G B ...")] = (),
+    colour_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SHARE ...")] = (4 / 255,),
     depth_noise: float = 0.001,
 ) -> None:
     """Search from images in a simulated cell, through a Searcher alone; status 1 where a search ended with an error.
@@ -144,8 +141,8 @@ def bench_cell(
       objects: numbers of objects, taken in turn.
       searches: how many, each of a scene of its own.
       seed: of the first scene; the others follow.
-      colors: red, green and blue of the target in 0 to 1, of several targets in turn; the file's if not given.
-      color_noise: standard deviations of every channel, as shares of full brightness, in turn.
+      colours: red, green and blue of the target in 0 to 1, of several targets in turn; the file's if not given.
+      colour_noise: standard deviations of every channel, as shares of full brightness, in turn.
       depth_noise: standard deviation of the depth [m].
     """
     from rich.console import Console
@@ -154,9 +151,9 @@ def bench_cell(
     from mechsearch_jax.runtime.files import check_writable
 
     at_least_one("lab cell", searches=searches, objects=min(objects, default=0))
-    if not color_noise:
-        raise InputError("lab cell: --color-noise is without a number; leave it out, or give one, as 0.016")
-    conditions = cell.Conditions(objects, colors, color_noise, depth_noise)
+    if not colour_noise:
+        raise InputError("lab cell: --colour-noise is without a number; leave it out, or give one, as 0.016")
+    conditions = cell.Conditions(objects, colours, colour_noise, depth_noise)
     check_writable(out)
     if scenarios:
         starts = [(scene.name, seed, scene) for scene in _scenes("cell", scenarios)]

@@ -11,7 +11,7 @@ from mechsearch_jax.commands.options import (
     find_scenarios,
     forget_kept_compilations,
 )
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import check_once
 
 Noise = Literal["clean", "gaussian", "time-of-flight"]
 Segments = Literal["network", "explained", "joined", "true"]
@@ -47,22 +47,20 @@ def bench_looks(
 
     from mechsearch_jax.benchmarks.lab.looks import looks
     from mechsearch_jax.benchmarks.lab.looks.pictures import taken
-    from mechsearch_jax.benchmarks.lab.tables.looks_tables import looks_tables
+    from mechsearch_jax.benchmarks.lab.tables import looks_tables
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.runtime.files import save_json
     from mechsearch_jax.workspace.scenario import load_scenario
 
     check_files(out)
-    files = find_scenarios(scenarios)
+    scenes = list(map(load_scenario, find_scenarios(scenarios)))
+    check_once("lab looks: two scenes", (scene.name for scene in scenes))
     console = Console(highlight=False)
     with console.status("rendering") as status:
         pictures = {}
-        for number, file in enumerate(files):
-            scenario = load_scenario(file)
-            if scenario.name in pictures:
-                raise InputError(f"lab looks: {file}: another scenario is named {scenario.name!r}, too; rename it")
-            pictures[scenario.name] = scenario, taken(Workcell(), scenario)
-            status.update(f"rendering {number + 1}/{len(files)}")
+        for number, scene in enumerate(scenes):
+            pictures[scene.name] = scene, taken(Workcell(), scene)
+            status.update(f"rendering {number + 1}/{len(scenes)}")
         bench = looks.LooksBench(pictures, tuple(dict.fromkeys(noise)), tuple(dict.fromkeys(segments)), seed)
         forget_kept_compilations()
         status.update("compiling")
@@ -95,17 +93,14 @@ def bench_bodies(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.looks import bodies
-    from mechsearch_jax.benchmarks.lab.tables.bodies_tables import bodies_tables
+    from mechsearch_jax.benchmarks.lab.tables import bodies_tables
     from mechsearch_jax.runtime.files import save_json
     from mechsearch_jax.workspace.scenario import load_scenario
 
     check_files(out)
-    scenes = {}
-    for file in find_scenarios(scenarios):
-        scenario = load_scenario(file)
-        if scenario.name in scenes:
-            raise InputError(f"lab bodies: {file}: another scenario is named {scenario.name!r}, too; rename it")
-        scenes[scenario.name] = scenario
+    loaded = list(map(load_scenario, find_scenarios(scenarios)))
+    check_once("lab bodies: two scenes", (scene.name for scene in loaded))
+    scenes = {scene.name: scene for scene in loaded}
     console = Console(highlight=False)
     with console.status("compiling") as status:
         bench = bodies.BodiesBench(scenes, tuple(dict.fromkeys(described_by)), seed)

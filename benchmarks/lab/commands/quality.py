@@ -21,7 +21,7 @@ from mechsearch_jax.commands.options import (
     forget_kept_compilations,
     settings_of,
 )
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_once
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -65,7 +65,7 @@ def bench_agreement(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts.agreement import agreement, draw_actions, generated_scenes
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import agreement_table
+    from mechsearch_jax.benchmarks.lab.tables import agreement_table
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import save_json
@@ -143,7 +143,7 @@ def bench_recognition(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.benchmarks.lab.tables import recognition_tables, recognition_times_table
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("lab recognition", worst=drawn.worst)
@@ -207,10 +207,7 @@ def _places(command: str, files: Sequence[Path], scenarios: Sequence[str]) -> di
 
     if files and scenarios:
         raise InputError(f"{command}: --config is for generated scenes; leave the scenario files out")
-    names = [file.stem for file in files]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"{command}: two configuration files are called {twice}; rename one")
+    check_once(f"{command}: two configuration files", (file.stem for file in files))
     return {file.stem: settings_of(file).workcell for file in files} or {"held-out": Workcell()}
 
 
@@ -239,7 +236,7 @@ def bench_segmentation(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, segmentation
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import segmentation_tables
+    from mechsearch_jax.benchmarks.lab.tables import segmentation_tables
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.viz.drawing import save_figure
 
@@ -291,7 +288,7 @@ def bench_push(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import push
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import push_scores_tables
+    from mechsearch_jax.benchmarks.lab.tables import push_scores_tables
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable, save_json
     from mechsearch_jax.train.run import counting
@@ -326,13 +323,11 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import scenes
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import scenes_table
+    from mechsearch_jax.benchmarks.lab.tables import scenes_table
     from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"lab scenes: two sources are called {twice}; rename one")
+    check_once("lab scenes: two sources", names)
     sources = {name: _loaded([given]) for name, given in zip(names, scenarios, strict=True)}
     if not sources:
         find_scenarios([])
@@ -348,7 +343,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
 
 
 def bench_detection(scenarios: Scenarios, /, *, places: int = 3, seed: int = 0, out: JsonFile = None) -> None:
-    """How well the target is detected by its color, by light, noise and other things' hues: rates, and false ones.
+    """How well the target is detected by its colour, by light, noise and other things' hues: rates, and false ones.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
@@ -359,7 +354,7 @@ def bench_detection(scenarios: Scenarios, /, *, places: int = 3, seed: int = 0, 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.detection.detection import conditions, detection_figures
-    from mechsearch_jax.benchmarks.lab.tables.parts_tables import detection_table
+    from mechsearch_jax.benchmarks.lab.tables import detection_table
     from mechsearch_jax.runtime.files import save_json
 
     check_files(out)

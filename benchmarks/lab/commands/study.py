@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.studies.studies import Study
-    from mechsearch_jax.benchmarks.running.evaluate import Job
-    from mechsearch_jax.benchmarks.running.planned import PlannedJob
+    from mechsearch_jax.benchmarks.running.evaluate import Job, PlannedJob
     from mechsearch_jax.benchmarks.store.rows import EpisodeRow
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.scenes.scene_sets import Block
@@ -93,7 +92,7 @@ def _planned(
     Raises:
       InputError: a variant cannot be used.
     """
-    from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+    from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, planned_jobs
 
     jobs: dict[str, PlannedJob] = {}
     for method, listed in _scenes(studies, scenes, engine):

@@ -48,7 +48,7 @@ def bench_targets(
 
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.lab.tables.targets_table import targets_table
+    from mechsearch_jax.benchmarks.lab.tables import targets_table
     from mechsearch_jax.benchmarks.lab.targets import everyday, graspable
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.problem.cache import keep_compilations

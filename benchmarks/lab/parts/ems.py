@@ -27,36 +27,18 @@ EXPONENTS = (0.05, 2.0)
 LEAST_POINTS = 11
 # Mean square distance that counts as exact, relative to the square of the scale.
 EXACT = 1e-7
-
-
-@dataclasses.dataclass(frozen=True)
-class EmsConfig:
-    """Settings of the recovery; lengths are relative to the segment's scale, the root mean square radius.
-
-    Attributes:
-      outliers: prior probability that a point is an outlier.
-      sigma: standard deviation of the Gaussian at the start.
-      iterations: largest number of iterations of expectation-maximisation, over all restarts.
-      tolerance: relative change of the cost below which it has converged.
-      evaluations: evaluations of the distances in one maximisation.
-      switches: largest number of switches to a similar superquadric.
-      largest: largest half-extent, relative to that of the points' bounding box; without it, extents that no points
-        bound would grow indefinitely.
-    """
-
-    outliers: float = 0.2
-    sigma: float = 0.3
-    iterations: int = 40
-    tolerance: float = 1e-3
-    evaluations: int = 4
-    switches: int = 2
-    largest: float = 2.0
-
-    def __post_init__(self):
-        if not 0 <= self.outliers < 1 or min(self.sigma, self.tolerance, self.largest) <= 0:
-            raise InputError("EmsConfig: outliers must be in [0, 1); sigma, tolerance and largest positive")
-        if self.iterations < 1 or self.evaluations < 1 or self.switches < 0:
-            raise InputError("EmsConfig: iterations and evaluations must be positive, switches not negative")
+# Prior probability that a point is an outlier.
+OUTLIERS = 0.2
+# Standard deviation of the Gaussian at the start, relative to the segment's scale, the root mean square radius.
+SIGMA = 0.3
+# Largest number of iterations of expectation-maximisation, over all restarts, and of evaluations of the distances in
+# one maximisation; relative change of the cost below which it has converged.
+ITERATIONS, EVALUATIONS, TOLERANCE = 40, 4, 1e-3
+# Largest number of switches to a similar superquadric.
+SWITCHES = 2
+# Largest half-extent, relative to that of the points' bounding box; without it, extents that no points bound would grow
+# indefinitely.
+LARGEST = 2.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -176,17 +158,15 @@ def _expect(shape: Recovered, points: np.ndarray, sigma: float, volume: float, o
     return odds, (float((odds * square).sum() / total) if total > 1e-9 else float(square.mean()))
 
 
-def recover(points: Float[np.ndarray, "n 3"], config: EmsConfig | None = None) -> Recovered:
+def recover(points: Float[np.ndarray, "n 3"]) -> Recovered:
     """The superquadric of a segment's points.
 
     Args:
       points: at least 11, not collinear [m].
-      config: the default if None.
 
     Raises:
       InputError: there are too few points, or a point is not finite.
     """
-    config = config or EmsConfig()
     points = np.asarray(points, float)
     if len(points) < LEAST_POINTS or not np.isfinite(points).all():
         raise InputError(f"recover: {len(points)} points; at least {LEAST_POINTS} finite ones are needed")
@@ -194,27 +174,27 @@ def recover(points: Float[np.ndarray, "n 3"], config: EmsConfig | None = None) -
     scale = float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))) or 1.0
     points = (points - middle) / scale
     extent = np.ptp(points, axis=0)
-    volume, limit = float(np.prod(np.maximum(extent, 0.1))), config.largest * float(extent.max()) / 2
+    volume, limit = float(np.prod(np.maximum(extent, 0.1))), LARGEST * float(extent.max()) / 2
 
     def climb(shape: Recovered, sigma: float, budget: int) -> tuple[Recovered, float]:
         for _ in range(budget):
-            odds, _ = _expect(shape, points, sigma, volume, config.outliers)
-            moved = _maximise(shape, points, odds, limit, config.evaluations)
-            _, cost = _expect(moved, points, sigma, volume, config.outliers)
-            settled = abs(shape.cost - cost) < config.tolerance * cost or cost < EXACT
+            odds, _ = _expect(shape, points, sigma, volume, OUTLIERS)
+            moved = _maximise(shape, points, odds, limit, EVALUATIONS)
+            _, cost = _expect(moved, points, sigma, volume, OUTLIERS)
+            settled = abs(shape.cost - cost) < TOLERANCE * cost or cost < EXACT
             shape = dataclasses.replace(moved, cost=cost, iterations=shape.iterations + 1)
             sigma = max(np.sqrt(cost / 3.0), 1e-3)
             if settled:
                 break
         return shape, sigma
 
-    shape, sigma = climb(_start(points), config.sigma, config.iterations)
-    for _ in range(config.switches):
-        budget = max(config.iterations - shape.iterations, 3)
+    shape, sigma = climb(_start(points), SIGMA, ITERATIONS)
+    for _ in range(SWITCHES):
+        budget = max(ITERATIONS - shape.iterations, 3)
         # A similar shape is compared by what it becomes after the same number of steps.
         climbed = [climb(dataclasses.replace(s, cost=np.inf), 3 * sigma, budget) for s in _similar(shape)]
-        best, best_sigma = min(climbed, key=lambda pair: _score(pair[0], points, sigma, volume, config))
-        if _score(best, points, sigma, volume, config) >= _score(shape, points, sigma, volume, config):
+        best, best_sigma = min(climbed, key=lambda pair: _score(pair[0], points, sigma, volume))
+        if _score(best, points, sigma, volume) >= _score(shape, points, sigma, volume):
             break
         shape, sigma = best, best_sigma
     return dataclasses.replace(
@@ -222,19 +202,17 @@ def recover(points: Float[np.ndarray, "n 3"], config: EmsConfig | None = None) -
     )
 
 
-def _score(shape: Recovered, points: np.ndarray, sigma: float, volume: float, config: EmsConfig) -> float:
+def _score(shape: Recovered, points: np.ndarray, sigma: float, volume: float) -> float:
     """Negative mean log-likelihood of the points at a common sigma."""
     square = _radial(shape, points) ** 2
-    inlier = (1.0 - config.outliers) * np.exp(-square / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma) ** 3
-    return -float(np.mean(np.log(inlier + config.outliers / volume + 1e-300)))
+    inlier = (1.0 - OUTLIERS) * np.exp(-square / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma) ** 3
+    return -float(np.mean(np.log(inlier + OUTLIERS / volume + 1e-300)))
 
 
-def recover_scene(
-    points: Float[np.ndarray, "p 3"], labels: Int[np.ndarray, " p"], capacity: int, config: EmsConfig | None = None
-) -> Superquadrics:
+def recover_scene(points: Float[np.ndarray, "p 3"], labels: Int[np.ndarray, " p"], capacity: int) -> Superquadrics:
     """Superquadrics of all segments of a cloud, in the slots of their labels; absent with too few points."""
     segments = [points[(labels == k) & np.isfinite(points).all(axis=1)] for k in range(capacity)]
-    shapes = [recover(segment, config) if len(segment) >= LEAST_POINTS else None for segment in segments]
+    shapes = [recover(segment) if len(segment) >= LEAST_POINTS else None for segment in segments]
     absent = Recovered(np.full(3, 1e-3), np.ones(2), np.zeros(3), np.eye(3), np.inf, 0)
     filled = [shape or absent for shape in shapes]
     size, exponents, position, rotation = (

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
@@ -16,7 +15,8 @@ from mechsearch_jax.envs.camera.recognisers import true_labels
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario
 from mechsearch_jax.images.cloud import View
 from mechsearch_jax.images.noise import NoiseModel, RandomDirection, TimeOfFlight, measured_depth, no_noise
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_once
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import PIXELS, cast_world, object_pixels, random_world
 from mechsearch_jax.workspace.camera import Camera
@@ -26,7 +26,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 NOISES: Mapping[str, NoiseModel] = {"clean": no_noise, "gaussian": RandomDirection(), "time-of-flight": TimeOfFlight()}
 
 
-class Shown(flax.struct.PyTreeNode):
+class Shown(PyTreeNode):
     """The input of a method.
 
     Attributes:
@@ -41,7 +41,7 @@ class Shown(flax.struct.PyTreeNode):
     depth: jax.Array
 
 
-class Look(flax.struct.PyTreeNode):
+class Look(PyTreeNode):
     """An image of a scene, and the visibility of its objects.
 
     Attributes:
@@ -97,10 +97,7 @@ def scenes_of(scenarios: Sequence[Scenario]) -> list[Scene]:
     Raises:
       InputError: two have the same name, so that their results could not be distinguished.
     """
-    names = [scenario.name for scenario in scenarios]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f'two scenarios have the name "{twice}"; rename one')
+    check_once("two scenes", (scenario.name for scenario in scenarios))
     return [Scene(scenario.name, "files", from_scenario(scenario)) for scenario in scenarios]
 
 

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +25,7 @@ from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.train.scenes import PIXELS
@@ -172,7 +172,7 @@ def figures(rows: Sequence[RecognitionRow], before: Sequence[RecognitionRow] | N
     return value
 
 
-class _Judged(flax.struct.PyTreeNode):
+class _Judged(PyTreeNode):
     finite: jax.Array
     iou: jax.Array
     centre: jax.Array

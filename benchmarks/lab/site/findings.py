@@ -153,7 +153,7 @@ def goal_of(quantity: Quantity, setting: Setting, row: EpisodeRow) -> str:
     """
     if quantity.startswith("find"):
         return "found"
-    trials = options_of(row).get("rehearsal", "none") != "none"
+    trials = options_of(row).get("trials", "none") != "none"
     return "retrieved" if trials and setting.grasps == ANY else "graspable"
 
 

@@ -19,7 +19,7 @@ from mechsearch_jax.benchmarks.lab.site.results_page import table
 from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
 from mechsearch_jax.benchmarks.lab.site.store_run import rates_of
 from mechsearch_jax.benchmarks.lab.site.stored_tables import results_of_runs, runs_of
-from mechsearch_jax.benchmarks.lab.studies.outcomes import COMPARED, OUTCOMES, WORDS
+from mechsearch_jax.benchmarks.lab.studies.comparison import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, Figures
 from mechsearch_jax.benchmarks.paper.reproduce import (
     FACTORS,

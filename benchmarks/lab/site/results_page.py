@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
-from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.settings import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
@@ -253,7 +253,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "batch_ready": clock["all compiled [s]"],
         "batch_seconds": clock["last episode [s]"] - clock["all compiled [s]"],
         **{
-            f"friction_{name}": share(reached(stored.run("rehearsal-frictions-cpu", run)["episodes"], "retrieved"))
+            f"friction_{name}": share(reached(stored.run("trials-frictions-cpu", run)["episodes"], "retrieved"))
             for name, run in frictions.items()
         },
         "starts": sum(each["scenes"] for each in starts),

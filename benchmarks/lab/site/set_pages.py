@@ -18,7 +18,7 @@ import jinja2
 
 from mechsearch_jax.benchmarks.lab.site.results_page import table
 from mechsearch_jax.benchmarks.lab.site.set_texts import ABOUT, CLUTTER, About, sets_of
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
+from mechsearch_jax.benchmarks.statistics.preset_names import FORMER_STANDARDS
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, SceneSet, digest, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
@@ -27,11 +27,11 @@ RESULTS = Path("benchmarks/results")
 OUT = Path("docs/scene-sets")
 MEASURES = ("retrieved", "found", "graspable")
 # What variants on a set's page may differ in; others belong to studies.
-SHOWN = ("policy", "recognition", "actions", "rehearsal", "retrieval_contact")
+SHOWN = ("policy", "recognition", "actions", "trials", "retrieval_contact")
 _PRESETS = ("standard", *FORMER_STANDARDS, "paper")
 _WORDS = {
-    "rehearsal=none": "without trials",
-    "rehearsal=learning": "with trials that learn the friction",
+    "trials=none": "without trials",
+    "trials=learning": "with trials that learn the friction",
     "retrieval_contact=False": "with grasps that touch nothing",
     "retrieval_contact=True": "with grasps that may touch objects",
 }
@@ -63,7 +63,7 @@ def label(line: Line) -> str:
     if "actions" in settings:
         *kinds, last = settings["actions"]
         words.append((", ".join(kinds) + " and " if kinds else "") + f"{last} alone")
-    pairs = (f"{name}={settings[name]}" for name in ("rehearsal", "retrieval_contact") if name in settings)
+    pairs = (f"{name}={settings[name]}" for name in ("trials", "retrieval_contact") if name in settings)
     words += [_WORDS.get(pair, pair) for pair in pairs]
     if line["simulator"] != _USUAL_SIMULATOR:
         words.append(f"in `{line['simulator']}`")

@@ -12,11 +12,11 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from mechsearch_jax.benchmarks.lab.studies.outcomes import OUTCOMES
+from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import TABLES
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
+from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.statistics.rates import mean_actions, scene_of
-from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, merged, started, variant_of, write_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, is_chosen_on

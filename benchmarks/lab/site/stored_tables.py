@@ -17,7 +17,7 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
     Setting,
     origin_of,
 )
-from mechsearch_jax.benchmarks.statistics.settings import FORMER_STANDARDS
+from mechsearch_jax.benchmarks.statistics.preset_names import FORMER_STANDARDS
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, EpisodeRow, episode_key
 from mechsearch_jax.benchmarks.store.runs import StoredRun, variant_of
 from mechsearch_jax.envs.scenes.scene_sets import find_scene

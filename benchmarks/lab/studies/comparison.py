@@ -7,12 +7,36 @@ from collections.abc import Callable, Mapping, Sequence
 
 from rich.table import Table
 
-from mechsearch_jax.benchmarks.lab.studies.outcomes import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.lab.studies.studies import Study, Variant
 from mechsearch_jax.benchmarks.statistics.intervals import with_interval
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.rates import actions_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
+
+
+def _drop_free(row: EpisodeRow) -> bool | None:
+    return None if row.objects_fallen is None and not row.is_error else row.objects_fallen == 0
+
+
+# What an episode reaches, by what stored runs call it; None where a row does not say. An error reaches nothing.
+OUTCOMES: Mapping[str, Callable[[EpisodeRow], bool | None]] = {
+    "found": lambda row: row.found_step is not None,
+    "graspable": lambda row: row.graspable_step is not None,
+    "paper_graspable": lambda row: row.paper_graspable,
+    "retrieved": lambda row: row.retrieved,
+    "drop_free": _drop_free,
+}
+# The same in the words of pages.
+WORDS: Mapping[str, str] = {
+    "found": "found",
+    "graspable": "graspable",
+    "paper_graspable": "with the paper's grasps",
+    "retrieved": "retrieved",
+    "drop_free": "drop-free",
+}
+# The shares that variants are compared by.
+COMPARED = ("found", "graspable", "retrieved", "drop_free")
+
 
 # What is compared, by the words of tables: a number for each episode, or None where its row does not say.
 SHARES = tuple(WORDS[name] for name in COMPARED)

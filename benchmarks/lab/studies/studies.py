@@ -11,7 +11,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from mechsearch_jax.benchmarks.statistics.settings import settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, EpisodeRow, options_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import Block, find_set, set_scenes

@@ -37,7 +37,7 @@ from mechsearch_jax.planner.trials import TrialResult, TrialScenes
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.robot.entry import ways_in
 from mechsearch_jax.robot.motion import MotionConfig
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_once
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes.compound import centred
 from mechsearch_jax.workspace.scenario import parse_compound
@@ -173,11 +173,9 @@ class TargetsBench:
     approaches: Approaches = dataclasses.field(default_factory=Approaches)
 
     def __post_init__(self):
-        names = Counter(mesh.name for mesh in self.meshes)
-        if not names:
+        if not self.meshes:
             raise InputError("lab targets: there are no meshes; name files, or make some with --things")
-        if (twice := next((name for name, count in names.items() if count > 1), None)) is not None:
-            raise InputError(f"lab targets: two meshes are called {twice}; rename one")
+        check_once("lab targets: two meshes", (mesh.name for mesh in self.meshes))
 
     @functools.cached_property
     def trials(self) -> NativeTrials:

@@ -23,8 +23,7 @@ def doctor(
     """
     from rich.console import Console
 
-    from mechsearch_jax.envs.health.checks import checks, examine
-    from mechsearch_jax.envs.health.finding import State
+    from mechsearch_jax.envs.health.cell_health import State, checks, examine
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import load_scenario
 

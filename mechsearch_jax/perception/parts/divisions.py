@@ -5,7 +5,6 @@ Lengths are in metres; coordinates are in the upright frame of a body: z up, x a
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.perception.scores import EDGE
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Sharp edges, as refinement fits them.
 SHARP = 0.03
@@ -34,7 +34,7 @@ _ALONG_X = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)
 _ALONG_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
 
 
-class Frame(flax.struct.PyTreeNode):
+class Frame(PyTreeNode):
     """The upright frame of a body.
 
     Attributes:

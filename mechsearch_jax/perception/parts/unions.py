@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -13,6 +12,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception import solids
 from mechsearch_jax.perception.scores import EDGE
 from mechsearch_jax.perception.selection import check_numbers
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Objects that are shrunk keep at least this share of their sizes.
 _LEAST = 0.3
@@ -44,7 +44,7 @@ class UnionCosts:
         check_numbers(self, positive=("wrong",))
 
 
-class Evidence(flax.struct.PyTreeNode):
+class Evidence(PyTreeNode):
     """What a segment is judged by.
 
     Attributes:
@@ -68,7 +68,7 @@ class Evidence(flax.struct.PyTreeNode):
     exact: jax.Array
 
 
-class Table(flax.struct.PyTreeNode):
+class Table(PyTreeNode):
     """What each of C candidates explains.
 
     Attributes:
