@@ -156,11 +156,11 @@ def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
 
 
 def test_parts_are_off_unless_they_are_named():
-    assert recogniser("masks", TARGET).fitter is as_segmented
+    assert recogniser("masks", TARGET).core.mask_fitter is as_segmented
     # A mask's segments are kept.
-    assert recogniser("masks-parts", TARGET).fitter == InParts(as_segmented, joining=separate)
-    assert recogniser("full-parts", TARGET).fitter == InParts(Connected(), joining=join_floating)
-    assert not isinstance(recogniser("full", TARGET).fitter, InParts)
+    assert recogniser("masks-parts", TARGET).core.mask_fitter == InParts(as_segmented, joining=separate)
+    assert recogniser("full-parts", TARGET).core.fitter == InParts(Connected(), joining=join_floating)
+    assert not isinstance(recogniser("full", TARGET).core.fitter, InParts)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.perception import segmentation
+from mechsearch_jax.networks import segmentation as networks
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, leave_out_smallest
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -53,7 +53,7 @@ def labels_of(monkeypatch, shelf, points, view=None):
         logits = jax.nn.one_hot(jnp.asarray(INSTANCE)[nearest], INSTANCES + 1)
         return types.SimpleNamespace(logits=logits[None, None])
 
-    monkeypatch.setattr(segmentation, "apply_network", network)
+    monkeypatch.setattr(networks, "apply_network", network)
     nowhere = jnp.zeros(points.shape[:2], bool)
     segmented = jax.jit(lambda points: NetworkSegmenter({}, None, view)(jax.random.key(0), shelf, points, nowhere))
     return np.asarray(segmented(points))[0]

@@ -1,6 +1,7 @@
 """f is opened again where an action may have moved the target unseen, and nowhere else."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import make, translate
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import step
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
@@ -219,19 +221,16 @@ def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
         updates.append((int(action.kind), before))
         return belief
 
-    monkeypatch.setattr(slots, "update_belief", update)
+    monkeypatch.setattr(step, "update_belief", update)
     monkeypatch.setattr(slots.OneSlot, "_snapshot", lambda self, world: Snapshot(problem.camera, problem.shelf, world))
     choice = Choice(push(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
     monkeypatch.setattr(slots, "chosen", lambda decision: choice)
-    monkeypatch.setattr(slots, "decide", lambda policy, trials, *arguments: policy(*arguments))
-
-    @dataclasses.dataclass
-    class Decided:
-        action: object = dataclasses.field(default_factory=push)
+    decided = types.SimpleNamespace(decision=types.SimpleNamespace(action=push()))
+    monkeypatch.setattr(slots, "decide", lambda *arguments, last: decided)
 
     views = [seen(BEFORE), seen(AFTER), seen(AFTER)]
     waiting = iter(views)
-    slot = slots.OneSlot(problem, lambda *_: Decided(), lambda *_: next(waiting))
+    slot = slots.OneSlot(problem, None, lambda *_: next(waiting))
     world, keys = world_of_none(), jax.random.split(jax.random.key(0), 1)
     slot.look(world, keys, [0])
     slot.decide(keys, [0])

@@ -26,7 +26,7 @@ from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import explanation, recognition
 from mechsearch_jax.perception import recogniser as recognising
-from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.perception.recogniser import Recogniser, labelled
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.state import Decision
@@ -196,7 +196,7 @@ def test_a_world_is_seen_by_one_program_from_both_cameras(two):
     world = jax.tree.map(jnp.asarray, from_scenario(SCENE))
     see, parts = (
         recogniser("masks", TARGET),
-        (recognisers.labelled, recognition.recognise_image, simulated_camera.observe),
+        (recognisers.taken, labelled, recognition.recognise_image, simulated_camera.observe),
     )
 
     def look(problem, given):
@@ -230,7 +230,7 @@ def test_a_sight_that_was_given_is_what_is_found_without(two):
 @pytest.mark.slow
 def test_images_are_recognised_by_one_program_for_both(two):
     images = example_images()
-    parts = recognising._labelled, explanation.explained_image
+    parts = recognising.labelled, explanation.explained_image
     first, second = map(Recogniser, two)
     seen = first(KEY, images.depth, images.colour)
     sizes = [cache_size(part) for part in parts]
