@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -60,7 +61,7 @@ class SimulatorConfig:
                 raise InputError(f"SimulatorConfig: {name} {value} must be a positive number")
 
 
-class Simulator:
+class Simulator(abc.ABC):
     """W simulated worlds: `NativeSimulator` on a CPU, `MjxSimulator` on a GPU.
 
     Attributes:
@@ -73,6 +74,7 @@ class Simulator:
     world: World | None = None
     takes_cells: bool = False
 
+    @abc.abstractmethod
     def reset(self, scenarios: Sequence[Scenario]) -> World:
         """Start episodes: every body at rest at its pose in the scenario, and the robot at home.
 
@@ -82,16 +84,18 @@ class Simulator:
         Raises:
           InputError: there are no scenarios, or more objects in one than slots.
         """
-        raise NotImplementedError
+        ...
 
+    @abc.abstractmethod
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
         """Start episodes in the given worlds, as `reset` does; the others stay exactly as they are.
 
         Raises:
           InputError: it was not reset before, or there are more objects in a scenario than slots.
         """
-        raise NotImplementedError
+        ...
 
+    @abc.abstractmethod
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
         """Set the state of all worlds, or of those in `only`, at rest and with the robot at home.
 
@@ -102,8 +106,9 @@ class Simulator:
         Raises:
           InputError: `only` is given, but the number of worlds differs from the present one.
         """
-        raise NotImplementedError
+        ...
 
+    @abc.abstractmethod
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Execute an action in every active world, let the bodies come to rest, and update `world`.
 
@@ -114,8 +119,9 @@ class Simulator:
         Raises:
           InputError: it was not reset before, there are not as many actions as worlds, or a kind is unknown.
         """
-        raise NotImplementedError
+        ...
 
+    @abc.abstractmethod
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Step with the robot where it is until everything is at rest, for at most `settle_steps`.
 
@@ -125,7 +131,7 @@ class Simulator:
         Raises:
           InputError: it was not reset before.
         """
-        raise NotImplementedError
+        ...
 
     def set_cells(self, cells: Mapping[int, TrueCell]) -> None:
         """Set the cells of worlds, by their numbers, for the next episodes that begin in them.
@@ -133,7 +139,7 @@ class Simulator:
         Raises:
           InputError: one of them has what this simulator cannot simulate.
         """
-        raise NotImplementedError
+        raise InputError(f"{self.engine}: its worlds cannot differ from what the planner assumes")
 
     def programs(self, world: World) -> Sequence[Program]:
         """The programs that it will call for these worlds, so that they are compiled beforehand; longest first.
@@ -159,6 +165,7 @@ class Simulator:
 class Flowing(Simulator):
     """A simulator whose worlds can begin actions while others are still moving."""
 
+    @abc.abstractmethod
     def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
         """Begin actions; worlds that are not active continue.
 
@@ -169,8 +176,9 @@ class Flowing(Simulator):
         Raises:
           InputError: as `execute`, or one of the worlds is moving.
         """
-        raise NotImplementedError
+        ...
 
+    @abc.abstractmethod
     def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
         """Step the moving worlds until more of them are done, and update `world` for these.
 
@@ -183,7 +191,7 @@ class Flowing(Simulator):
         Raises:
           InputError: the simulator was not reset.
         """
-        raise NotImplementedError
+        ...
 
 
 def check_actions(name: str, actions: Action, worlds: int) -> None:
