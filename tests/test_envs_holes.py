@@ -197,7 +197,7 @@ def test_a_target_without_depth_is_not_seen(name, visible):
 def test_masks_have_no_points_in_holes():
     masks, view, world = recogniser("masks", target_of(OPEN)), thinned_view(CAMERA, SHELF), from_scenario(OPEN)
     images = masks.images(jax.random.key(0), Snapshot(CAMERA, SHELF, world, sensing=sensed("target", OPEN)))
-    image, visible, _ = labelled(masks.core, jax.random.key(0), CAMERA, view, SHELF, images)
+    image, visible = labelled(masks.core, jax.random.key(0), CAMERA, view, SHELF, images)
     there = np.asarray(observe(view.camera, world, SHELF).segmentation) == TARGET
     assert there.sum() > 100
     assert np.isnan(np.asarray(image.points)[there]).all()

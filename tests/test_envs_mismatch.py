@@ -223,7 +223,7 @@ def test_a_lying_box_and_a_body_of_parts_stay_on_the_board():
 def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
     masks = dataclasses.replace(recogniser("masks", target_of(SCENE)), noise=no_noise)
     shot, key = snapshot(mismatch), jax.random.key(0)
-    image, _, _ = labelled(masks.core, key, CAMERA, shot.view, SHELF, masks.images(key, shot))
+    image, _ = labelled(masks.core, key, CAMERA, shot.view, SHELF, masks.images(key, shot))
     points, labels = np.asarray(image.points), np.asarray(image.labels)
     seen, there = oracle(jax.random.key(0), shot).objects, snapshot().world
     for slot in np.flatnonzero(seen.valid):

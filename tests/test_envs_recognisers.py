@@ -140,7 +140,7 @@ def shown():
 
     def see(world):
         images = full.images(key, Snapshot(CAMERA, SHELF, world))
-        image, seen, _ = labelled(curious, key, CAMERA, view, SHELF, images)
+        image, seen = labelled(curious, key, CAMERA, view, SHELF, images)
         owner = np.asarray(observe(view.camera, world, SHELF).segmentation)
         return jax.tree.map(np.asarray, image), owner, bool(seen)
 
@@ -278,7 +278,7 @@ def test_a_target_that_is_not_detected_is_given_to_no_object(world):
     x, _, z = SCENE.target.position
     peeping = moved(world, TARGET, [x, -0.034, z])
     images = full.images(key, Snapshot(CAMERA, SHELF, peeping))
-    fitted, visible, _ = full.core.fitted(CAMERA, view, SHELF, images)
+    fitted, visible = full.core.fitted(CAMERA, view, SHELF, images)
     owner = np.asarray(observe(view.camera, peeping, SHELF).segmentation)
     labels = np.asarray(fitted.labels)[owner == TARGET]
     assert not visible

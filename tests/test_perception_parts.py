@@ -67,7 +67,7 @@ def seen(*bodies):
     world = from_scenario(Scenario("parts", bodies, HIDDEN))
     snapshot = Snapshot(CAMERA, SHELF, world)
     view, keys, eyes = snapshot.view, jax.random.split(jax.random.key(2)), recogniser("masks", TARGET)
-    image, _, _ = labelled(eyes.core, keys[0], CAMERA, view, SHELF, eyes.images(jax.random.key(1), snapshot))
+    image, _ = labelled(eyes.core, keys[0], CAMERA, view, SHELF, eyes.images(jax.random.key(1), snapshot))
     return image, view, as_segmented(keys, image, ShapeNetwork.of(), view.camera, SHELF, TARGET, RefinementConfig())
 
 

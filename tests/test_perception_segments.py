@@ -129,7 +129,7 @@ def test_each_household_thing_of_a_shelf_has_one_segment():
     eyes, key = recognisers.recogniser("full-parts", Target.of("cylinder")), jax.random.key(0)
     core = eyes.core
     unseen = found_pixels(snapshot.camera) / view.stride**2
-    seen, _, _ = labelled(core, key, snapshot.camera, view, snapshot.shelf, eyes.images(key, snapshot))
+    seen, _ = labelled(core, key, snapshot.camera, view, snapshot.shelf, eyes.images(key, snapshot))
     after = np.asarray(connected_segments(seen.points, seen.labels, CONFIG, SAMPLED * unseen))
     true = np.asarray(
         recognisers.true_labels(seen.points, recognisers.observe(view.camera, world, Shelf()).segmentation, Shelf())

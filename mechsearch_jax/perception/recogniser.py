@@ -131,24 +131,22 @@ class ViewRecogniser(PyTreeNode):
           shelf: in the images.
           images: of the view.
         """
-        fitted, visible, share = self.fitted(camera, view, shelf, images)
+        fitted, visible = self.fitted(camera, view, shelf, images)
+        share = measured_share(camera, view, images.depth)
         return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, share)
 
-    def fitted(
-        self, camera: Camera, view: View, shelf: Shelf, images: ViewImages
-    ) -> tuple[Fitted, Bool[Array, ""], Float[Array, "rows columns"]]:
-        """What was made of the images, with the pixels of each object; whether the target is visible; and the share of
-        the full image that was measured, see `images.measured.measured_share`.
+    def fitted(self, camera: Camera, view: View, shelf: Shelf, images: ViewImages) -> tuple[Fitted, Bool[Array, ""]]:
+        """What was made of the images, with the pixels of each object, and whether the target is visible.
 
         Args:
           camera, view, shelf, images: as above.
         """
         # Not of the caller's key, lest an object be seen or not by chance.
         keys = jax.random.split(jax.random.key(0), 3)
-        image, visible, share = labelled(self, keys[0], camera, view, shelf, images)
+        image, visible = labelled(self, keys[0], camera, view, shelf, images)
         fitter = self.fitter if images.mask is None else self.mask_fitter
         settings = (self.shapes, view.camera, shelf, self.target, self.refinement)
-        return fitter(keys[1:], image, *settings, least=SAMPLED * _threshold(camera, view)), visible, share
+        return fitter(keys[1:], image, *settings, least=SAMPLED * _threshold(camera, view)), visible
 
 
 @jax.tree_util.register_pytree_node_class
@@ -288,7 +286,7 @@ class Recogniser:
     @in_own_settings
     def fitted(
         self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
-    ) -> tuple[Fitted, Bool[Array, ""], Float[Array, "rows columns"]]:
+    ) -> tuple[Fitted, Bool[Array, ""]]:
         """`ViewRecogniser.fitted` of a camera's images, which are not checked."""
         images = view_images(self.view, depth, colour, mask, target_id)
         return self.core.fitted(self.camera, self.view, self.shelf, images)
@@ -319,8 +317,8 @@ def _threshold(camera: Camera, view: View) -> float:
 @cached_jit()
 def labelled(
     core: ViewRecogniser, key: Key[Array, ""], camera: Camera, view: View, shelf: Shelf, images: ViewImages
-) -> tuple[LabelledImage, Bool[Array, ""], Float[Array, "rows columns"]]:
-    """The images of a view with labels, whether the target is visible in them, and what of the full image was measured.
+) -> tuple[LabelledImage, Bool[Array, ""]]:
+    """The images of a view with labels, and whether the target is visible in them.
 
     Args:
       core: labels them.
@@ -354,7 +352,7 @@ def labelled(
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
         visible = (jnp.sum(of_target) > threshold).astype(bool)
     image = LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible)
-    return image, visible, measured_share(camera, view, seen)
+    return image, visible
 
 
 def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:

@@ -265,7 +265,7 @@ class BodiesBench:
         world = from_scenario(scenario)
         snapshot = Snapshot(camera, shelf, world)
         seeing: Any = recogniser("masks", self.workcell.target)
-        image, _, _ = labelled(seeing.core, key, camera, snapshot.view, shelf, seeing.images(key, snapshot))
+        image, _ = labelled(seeing.core, key, camera, snapshot.view, shelf, seeing.images(key, snapshot))
         alone = [
             int((observe(snapshot.view.camera, _only(world, slot), shelf).segmentation == slot).sum())
             for slot in range(len(scenario.objects))

@@ -260,7 +260,7 @@ class LooksBench:
             images["colour"] = noisy_colour(picture, seed)
         key = jax.random.fold_in(jax.random.key(self.seed), index)
         start = time.perf_counter()
-        fitted, visible, _ = jax.block_until_ready(recogniser.fitted(key, **images))
+        fitted, visible = jax.block_until_ready(recogniser.fitted(key, **images))
         return fitted, bool(visible), time.perf_counter() - start
 
 
