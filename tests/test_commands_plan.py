@@ -51,8 +51,11 @@ def see(problem, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "either --depth IMAGE or --example"),
-        (("--depth", "d.png", "--example"), "either --depth IMAGE or --example"),
+        ((), "give one of --depth IMAGE, --bop FOLDER, --bag BAG and --example"),
+        (("--depth", "d.png", "--example"), "give one of --depth IMAGE, --bop FOLDER, --bag BAG and --example"),
+        (("--depth", "d.png", "--image", "3"), "--image is a number in --bop or --bag"),
+        (("--bop", "scene", "--topics", "depth=/d"), "--topics are those of --bag"),
+        (("--bop", "scene", "--colour", "c.png"), "--bop has images and a camera of its own"),
         (("--example", "--mask", "m.png"), "leave --colour, --mask and --camera out"),
         (("--depth", "d.png", "--target-id", "3"), "give --mask, too"),
         (("--depth", "missing.png"), "missing.png: cannot be read"),
@@ -70,7 +73,7 @@ def test_a_number_of_the_target_that_the_mask_file_does_not_have_is_said(tmp_pat
     save_depth(IMAGES.depth, depth)
     save_mask(IMAGES.mask, mask, 255)
     for number, words in ((200, "no pixel holds the target's number 200"), (-1, ""), (0, "")):
-        images, said = plan.ImageFiles(depth, mask=mask, target_id=number).load()
+        images, _, said = plan.ImageFiles((depth,), mask=mask, target_id=number).load(None, IMAGES.camera)
         assert images["target_id"] == (0 if number == 0 else -1)
         assert words in " ".join(said)
         assert bool(said) == bool(words)

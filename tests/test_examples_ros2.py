@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from test_search_whole_trajectory import pushed, taken
 
+from mechsearch_jax.images.lens import Lens
 from mechsearch_jax.workspace.camera import Camera
 
 NODE = Path(__file__).parents[1] / "examples" / "ros2" / "search_node.py"
@@ -238,6 +239,8 @@ def published(stand_in, seconds=10, width=0.03):
     depth = image(np.full((3, 4), 1500, np.uint16), "16UC1", seconds)
     stand_in.publish("/camera/camera/aligned_depth_to_color/image_raw", depth)
     stand_in.publish("/camera/camera/color/image_raw", image(np.full((3, 4, 3), 7, np.uint8), "rgb8", seconds))
+    info = INFO(width=4, height=3, k=[4.0, 0.0, 1.5, 0.0, 4.0, 1.0, 0.0, 0.0, 1.0])
+    stand_in.publish("/camera/camera/color/camera_info", info)
     stand_in.publish("/joint_states", STATE(name=JOINTS, position=HERE))
     fingers = [f"fr3_finger_joint{i}" for i in (1, 2)]
     stand_in.publish("/joint_states", STATE(name=fingers, position=[width / 2] * 2))
@@ -265,15 +268,14 @@ def test_the_camera_has_its_own_intrinsics_and_the_configured_pose(start):
     example, _, _ = start()
     info = INFO(width=848, height=480, d=[0.0] * 5, k=[424.0, 0.0, 423.5, 0.0, 425.0, 239.5, 0.0, 0.0, 1.0])
     usual = Camera()
-    camera = example.camera_of(info, usual)
+    camera = example.lens_of(info, usual).camera
     assert camera == dataclasses.replace(usual, width=848, height=480, fx=424.0, fy=425.0, cx=424.0, cy=240.0)
-    info.d = [0.1]
-    with pytest.raises(ValueError, match="distorts"):
-        example.camera_of(info, usual)
+    info.d, info.distortion_model = [0.1, 0.0, 0.0, 0.0, 0.0], "plumb_bob"
+    assert example.lens_of(info, usual) == Lens(camera, (0.1, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="p holds no focal lengths"):
-        example.camera_of(INFO(p=[0.0] * 12), usual, rectified=True)
+        example.lens_of(INFO(p=[0.0] * 12), usual, rectified=True)
     info.p = [400.0, 0.0, 400.5, 0.0, 0.0, 401.0, 220.5, 0.0, 0.0, 0.0, 1.0, 0.0]
-    camera = example.camera_of(info, usual, rectified=True)
+    camera = example.lens_of(info, usual, rectified=True).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (400.0, 401.0, 401.0, 221.0)
 
 

@@ -183,7 +183,8 @@ MISTAKES = {
     ),
     "camera file: a field is missing": lambda tmp: camera_file(tmp, K=None),
     "camera file: a field is unknown": lambda tmp: camera_file(tmp, widht=3),
-    "camera file: the lens distorts": lambda tmp: camera_file(tmp, D=[0.1, 0.0, 0.0, 0.0, 0.0]),
+    "camera file: the lens distorts, in `load_camera`": lambda tmp: camera_file(tmp, D=[0.1, 0.0, 0.0, 0.0, 0.0]),
+    "camera file: a fisheye": lambda tmp: camera_file(tmp, distortion_model="equidistant"),
     "camera file: K with too few numbers": lambda tmp: camera_file(tmp, K=[600.0, 600.0, 640.0, 360.0]),
     "camera file: pose transposed": lambda tmp: camera_file(tmp, T_world_camera=T.T.tolist()),
     "camera file: a pose that is no rotation": lambda tmp: camera_file(

@@ -18,12 +18,14 @@ from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.fit import fit_shelf
 from mechsearch_jax.calibration.report import report
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.images.bop import bop_image
 from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.examples import Images, example_images, load_images, save_images
 from mechsearch_jax.images.image_files import (
     load_camera,
     load_colour,
     load_depth,
+    load_lens,
     load_mask,
     save_camera,
     save_colour,
@@ -99,9 +101,26 @@ def weights(rng, folder):
 
 
 def camera_file(rng, folder):
-    save_camera(SMALL, folder / "file.json")
+    """Half of them of a lens that distorts, with an image that is undistorted."""
+    save_camera(SMALL, folder / "file.json", ((), (-0.2, 0.05, 0.001, 0.0, 0.01))[rng.randrange(2)])
     (folder / "file.json").write_bytes(either(rng, (folder / "file.json").read_bytes(), mutated_json))
-    return lambda: load_camera(folder / "file.json")
+
+    def load():
+        lens = load_lens(folder / "file.json")
+        if max(lens.camera.width, lens.camera.height) < 100:
+            lens.depth(np.ones((lens.camera.height, lens.camera.width), np.float32))
+
+    return load
+
+
+def scene(rng, folder):
+    """The cameras of a BOP scene."""
+    (folder / "depth").mkdir()
+    save_depth(np.ones((9, 16), np.float32), folder / "depth" / "000003.png")
+    pose = {"cam_R_w2c": np.eye(3).ravel().tolist(), "cam_t_w2c": [0.0, 1.0, 2.0]}
+    good = {"3": {"cam_K": [9.0, 0.0, 8.0, 0.0, 9.0, 4.0, 0.0, 0.0, 1.0], "depth_scale": 0.5, **pose}}
+    (folder / "scene_camera.json").write_bytes(either(rng, json.dumps(good).encode(), mutated_json))
+    return lambda: bop_image(folder, 3)
 
 
 def picture(rng, folder):
@@ -124,7 +143,7 @@ def picture(rng, folder):
     return lambda: load(path)
 
 
-KINDS = {kind.__name__: kind for kind in (scenario, config, camera, camera_file, images, picture, weights)}
+KINDS = {kind.__name__: kind for kind in (scenario, config, camera, camera_file, scene, images, picture, weights)}
 
 
 def check(kind, number, folder):

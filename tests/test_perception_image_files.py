@@ -79,7 +79,9 @@ def changed(**changes):
     [
         (changed(width=0), "width must be a whole number"),
         (changed(K=[1, 2]), "K must be 9 numbers"),
-        (changed(D=[0.1, 0.0]), "the lens distorts"),
+        (changed(D=[0.1, 0.0]), "D must have 4 or 5 or 8 numbers"),
+        (changed(D=[0.1, 0.0, 0.0, 0.0]), "the lens distorts"),
+        (changed(distortion_model="equidistant"), "distortion_model equidistant is not understood"),
         (changed(T_world_camera=np.eye(4).T.tolist()[:3]), "T_world_camera must be 16 numbers"),
         (lambda v: v | {"T_world_camera": np.transpose(v["T_world_camera"]).tolist()}, "transposed"),
         (lambda v: {key: part for key, part in v.items() if key != "K"}, "K is missing"),

@@ -10,7 +10,7 @@ parameters.
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import signal
 import threading
 import time
@@ -29,6 +29,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from mechsearch_jax.envs.cell.loading import load_searcher
+from mechsearch_jax.images.ros_images import colour_of, depth_of, lens_of
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.robot.arm_config import ARMS
 from mechsearch_jax.robot.ros_messages import gripper_command_goal, hand_goal, joint_trajectory_message, legs
@@ -56,50 +57,6 @@ PARAMETERS = {
     "widest": 0.079,
     "confirm": True,
 }
-
-
-def pixels(image, kinds):
-    """The array of a `sensor_msgs/Image`, whose encoding must be one of `kinds`: type and number of channels."""
-    if image.encoding not in kinds:
-        raise ValueError(f"images of encoding {image.encoding} cannot be used; publish one of {', '.join(kinds)}")
-    kind, channels = kinds[image.encoding]
-    dtype = np.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
-    rows = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)
-    row = np.ascontiguousarray(rows[:, : image.width * channels * dtype.itemsize])
-    return row.view(dtype).reshape(image.height, image.width, channels).astype(kind)
-
-
-def depth_of(image):
-    """Depth in metres, float32 (H, W); 0 or NaN where nothing was measured."""
-    array = pixels(image, {"16UC1": (np.uint16, 1), "mono16": (np.uint16, 1), "32FC1": (np.float32, 1)})[..., 0]
-    return array if array.dtype == np.float32 else array.astype(np.float32) * np.float32(0.001)
-
-
-def colour_of(image):
-    """Red, green and blue, uint8 (H, W, 3)."""
-    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
-    array = pixels(image, {name: (np.uint8, count) for name, count in channels.items()})[..., :3]
-    return array[..., ::-1].copy() if image.encoding.startswith("bgr") else array
-
-
-def camera_of(info, camera, rectified=False):
-    """The configuration's camera, which has the pose, with the intrinsics of a `CameraInfo`.
-
-    Those of `rectified` images, as image_proc publishes them, are in p; k and d are of the raw images.
-    """
-    if rectified:
-        fx, _, cx, _, _, fy, cy = (float(value) for value in info.p[:7])
-    elif any(abs(value) > 1e-6 for value in info.d):
-        raise ValueError(
-            "camera_info: the lens distorts; subscribe to rectified images, and set rectified:=true if they have the "
-            "camera_info of the raw ones, as image_proc's"
-        )
-    else:
-        fx, _, cx, _, fy, cy = (float(value) for value in info.k[:6])
-    if fx <= 0.0 or fy <= 0.0:
-        raise ValueError(f"camera_info: {'p' if rectified else 'k'} holds no focal lengths; calibrate the camera")
-    # In ROS the centre of the first pixel is at 0.
-    return dataclasses.replace(camera, width=info.width, height=info.height, fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5)
 
 
 def filled(message, values):
@@ -204,22 +161,24 @@ class SearchNode(Node):
         fingers = [self._position(name) for name in self.finger_names]
         return None if None in fingers else sum(fingers)
 
-    def camera_info(self):
+    @functools.cached_property
+    def lens(self):
+        """The camera, and how its lens distorts, for good: with the configured pose."""
         self._wait_for(lambda: "camera_info" in self._latest, "the camera's intrinsics")
-        return self._latest["camera_info"]
+        return lens_of(self._latest["camera_info"], self.settings.workcell.camera, self.given["rectified"])
 
     def now(self):
         return 1e-9 * self.get_clock().now().nanoseconds
 
     def look(self, since):
-        """A depth and a colour image that belong together and were taken after `since` [s]."""
+        """A depth and a colour image that belong together and were taken after `since` [s], undistorted."""
 
         def arrived():
             stamps = [seconds_of(self._latest[n].header.stamp) for n in ("depth", "colour") if n in self._latest]
             return len(stamps) == 2 and min(stamps) > since and max(stamps) - min(stamps) <= SLOP
 
         self._wait_for(arrived, "new depth and colour images")
-        return depth_of(self._latest["depth"]), colour_of(self._latest["colour"])
+        return self.lens.depth(depth_of(self._latest["depth"])), self.lens.colour(colour_of(self._latest["colour"]))
 
     def follow(self, trajectory):
         """Execute a trajectory leg by leg; whether the hand did all that it was to do.
@@ -378,8 +337,9 @@ def main():
     threading.Thread(target=executor.spin, daemon=True).start()
     try:
         path = node.given["config"] or None
-        camera = camera_of(node.camera_info(), node.settings.workcell.camera, node.given["rectified"])
-        searcher = load_searcher(path, camera=camera, arm=node.model)
+        if node.lens.distorts:
+            node.get_logger().info("images are undistorted by d of camera_info; if they are rectified: rectified:=true")
+        searcher = load_searcher(path, camera=node.lens.camera, arm=node.model)
         for warning in searcher.check().warnings:
             node.get_logger().warning(warning)
         searcher.warm_up(lambda what, left: node.get_logger().info(f"preparing {what}"), colour=True)

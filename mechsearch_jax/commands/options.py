@@ -251,6 +251,14 @@ def settings_of(file: Path | None) -> Settings:
     return Settings() if file is None else load_settings(file)
 
 
+def base_of(file: Path | None) -> tuple[float, float, float]:
+    """Where the robot's base stands in a configuration file's frame [m]; at its origin without a file."""
+    from mechsearch_jax.problem.settings import Base
+    from mechsearch_jax.runtime.tables import read_document, with_table
+
+    return Base().position if file is None else with_table(read_document(file), "base", Base()).position
+
+
 def chosen_policies(command: str, method: Sequence[str] | None, policy: Sequence[str] | None) -> Sequence[str]:
     """The policies that `--policy` or `--method` names; default: search-for-grasp.
 

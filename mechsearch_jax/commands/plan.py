@@ -29,22 +29,33 @@ class ImageFiles:
     """The images that are decided from.
 
     Attributes:
-      depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
+      depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres. Of several of one
+        look each pixel's median is taken where at least half of them measured it.
       colour: colour image, registered to the depth image; the target is seen by its colour.
       mask: image of whole numbers, one for each object, registered to the depth image; without it the segmentation
         network tells the objects apart.
       background: the number in the mask that stands for no object.
-      target_id: the target's number in the mask, where the mask shows it.
+      target_id: the target's number in the mask, or in the names of a BOP scene's masks, where it shows the target.
       camera: JSON with the fields of a ROS CameraInfo and T_world_camera; the configuration's camera if not given.
+        Images of a lens that distorts (D) are undistorted.
+      bop: folder of a BOP scene, with images, masks and camera; the configuration's pose if it has none of its own.
+      bag: bag of ROS 1 (.bag) or ROS 2 (folder), with images and CameraInfo; the pose is the configuration's.
+      image: number of the image in the BOP scene, or of the depth image in the bag, from 0; its last if not given.
+      topics: of the bag, as depth=/camera/depth colour=/camera/colour info=/camera/camera_info; those that are left
+        out are found by their type.
       example: take the images that ship with the package, and write them to --out, too, as files like yours.
     """
 
-    depth: ImageFile = None
+    depth: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="IMAGE ...", help_behavior_hint="")] = ()
     colour: ImageFile = None
     mask: ImageFile = None
     background: int = BACKGROUND
     target_id: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json", help_behavior_hint="")] = None
+    bop: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    bag: Annotated[Path | None, tyro.conf.arg(metavar="BAG", help_behavior_hint="")] = None
+    image: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    topics: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=TOPIC ...", help_behavior_hint="")] = ()
     example: bool = False
 
     def check(self) -> None:
@@ -53,31 +64,68 @@ class ImageFiles:
         Raises:
           InputError: they do not.
         """
-        if self.example == (self.depth is not None):
-            raise InputError("plan: give either --depth IMAGE or --example, not both")
-        if self.example and not self.colour is self.mask is self.camera is None:
+        given = {"--depth": self.depth, "--example": self.example, "--bop": self.bop, "--bag": self.bag}
+        chosen = [name for name, value in given.items() if value]
+        if len(chosen) != 1:
+            raise InputError("plan: give one of --depth IMAGE, --bop FOLDER, --bag BAG and --example")
+        if not self.depth and not self.colour is self.mask is self.camera is None:
             raise InputError(
-                "plan: --example has images and a camera of its own; leave --colour, --mask and --camera out"
+                f"plan: {chosen[0]} has images and a camera of its own; leave --colour, --mask and --camera out"
             )
-        if self.target_id is not None and self.mask is None:
+        if self.target_id is not None and self.mask is None and self.bop is None:
             raise InputError("plan: --target-id names a number of a mask; give --mask, too")
+        if self.image is not None and self.bop is self.bag is None:
+            raise InputError("plan: --image is a number in --bop or --bag; give one of them, too")
+        if self.topics and self.bag is None:
+            raise InputError("plan: --topics are those of --bag; give it, too")
 
-    def load(self) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """The arguments of `Searcher.next` from files, and warnings about them.
+    def load(self, config: Path | None, camera: Camera) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
+        """The arguments of `Searcher.next`, their camera, and warnings about them.
+
+        Args:
+          config: the configuration file, if there is one.
+          camera: its camera, or the default one.
 
         Raises:
           InputError: a file cannot be used.
         """
+        if self.depth:
+            return self._from_files(camera)
+        if self.bop is not None:
+            from mechsearch_jax.commands.options import base_of
+            from mechsearch_jax.images.bop import bop_image
+
+            x, y, z = base_of(config)
+            posed = None if config is None else camera.moved((x, y, z))
+            images = bop_image(self.bop, self.image, camera=posed, target=self.target_id)
+            images = dataclasses.replace(images, camera=images.camera.moved((-x, -y, -z)))
+        else:
+            from mechsearch_jax.images.bags import bag_images
+
+            assert self.bag is not None
+            if config is None:
+                raise InputError("plan: --bag does not say where the camera is; say so in [camera] of --config")
+            topics = {name: topic for name, _, topic in (each.partition("=") for each in self.topics)}
+            images = bag_images(self.bag, camera, topics=topics, image=self.image)
+        names = ("depth", "colour", "mask", "target_id")
+        arguments = {name: value for name in names if (value := getattr(images, name)) is not None}
+        return arguments, images.camera, ()
+
+    def _from_files(self, camera: Camera) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
         from mechsearch_jax.images import image_files
         from mechsearch_jax.images.labels import INSTANCES
+        from mechsearch_jax.images.lens import Lens
+        from mechsearch_jax.images.measured import median_depth
 
-        assert self.depth is not None
-        images: dict[str, Any] = {"depth": image_files.load_depth(self.depth)}
+        lens = Lens(camera) if self.camera is None else image_files.load_lens(self.camera)
+        frames = [image_files.load_depth(path) for path in self.depth]
+        images: dict[str, Any] = {"depth": lens.depth(median_depth(frames) if len(frames) > 1 else frames[0])}
         warnings = ()
         if self.colour is not None:
-            images["colour"] = image_files.load_colour(self.colour)
+            images["colour"] = lens.colour(image_files.load_colour(self.colour))
         if self.mask is not None:
-            images["mask"], numbers = image_files.load_mask(self.mask, self.background)
+            mask, numbers = image_files.load_mask(self.mask, self.background)
+            images["mask"] = lens.mask(mask)
             if self.target_id is not None:
                 # A number that the mask does not show: the target is not seen.
                 images["target_id"] = numbers.get(self.target_id, -1)
@@ -92,7 +140,7 @@ class ImageFiles:
                     f"{self.mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one "
                     "out"
                 )
-        return images, warnings
+        return images, lens.camera, warnings
 
 
 def plan(
@@ -122,7 +170,6 @@ def plan(
 
     from mechsearch_jax.commands.options import settings_of
     from mechsearch_jax.envs.cell.loading import searcher_of
-    from mechsearch_jax.images.image_files import load_camera
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
 
@@ -132,8 +179,7 @@ def plan(
     if images.example:
         (arguments, camera), warnings = _example(out), ()
     else:
-        camera = settings.workcell.camera if images.camera is None else load_camera(images.camera)
-        arguments, warnings = images.load()
+        arguments, camera, warnings = images.load(config, settings.workcell.camera)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
@@ -179,6 +225,8 @@ def _example(out: Path) -> tuple[dict[str, Any], Camera]:
     from mechsearch_jax.images.examples import example_images
 
     images = example_images()
+    assert images.colour is not None
+    assert images.mask is not None
     image_files.save_depth(images.depth, out / "depth.png")
     image_files.save_colour(images.colour, out / "colour.png")
     image_files.save_mask(images.mask, out / "mask.png", BACKGROUND)

@@ -1,4 +1,4 @@
-"""Example images that ship with the package."""
+"""Images that belong together, and those that ship with the package."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class Images:
 
     Attributes:
       depth: float32 (H, W), metres along the camera's z; 0 where nothing was measured.
-      colour: uint8 (H, W, 3), red, green and blue.
-      mask: int8 (H, W), the number of the object that a pixel shows, or what `images.labels` has.
+      colour: uint8 (H, W, 3), red, green and blue; None if there is none, as in a data set or bag without.
+      mask: int8 (H, W), the number of the object that a pixel shows, or what `images.labels` has; None if none.
       target_id: the target's number in the mask; None if it is not visible.
       camera: intrinsics and pose in the world, the robot's base.
     """
 
     depth: Float[np.ndarray, "h w"]
-    colour: UInt8[np.ndarray, "h w 3"]
-    mask: Int[np.ndarray, "h w"]
+    colour: UInt8[np.ndarray, "h w 3"] | None
+    mask: Int[np.ndarray, "h w"] | None
     target_id: int | None
     camera: Camera
 
@@ -98,8 +98,10 @@ def save_images(images: Images, path: PathLike) -> None:
     """Write images in the format of the shipped ones; depths are rounded to millimetres.
 
     Raises:
-      InputError: the file cannot be written.
+      InputError: the file cannot be written, or colour image or mask is missing.
     """
+    if images.colour is None or images.mask is None:
+        raise InputError(f"{path}: images without colour or mask cannot be written")
     rest = {"target_id": images.target_id, "camera": dataclasses.asdict(images.camera)}
     buffer = io.BytesIO()
     np.savez_compressed(

@@ -5,7 +5,7 @@
 | depth | PNG or TIFF of 16 bits in millimetres; TIFF or `.npy` of floats in metres; 0 or NaN for not measured |
 | colour | PNG or JPEG, 8 bits a channel |
 | mask | PNG or `.npy` of whole numbers, one for each object, and one for the background |
-| camera | JSON with the fields of a ROS `sensor_msgs/CameraInfo` and `T_world_camera` |
+| camera | JSON with the fields of a ROS `sensor_msgs/CameraInfo` and `T_world_camera`; a lens that distorts, too |
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.lens import Lens, distortion_of
 from mechsearch_jax.runtime.errors import InputError, nearest, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing, save_json
 from mechsearch_jax.workspace.camera import Camera
@@ -33,9 +34,9 @@ MILLIMETRE = 0.001
 LARGEST_NUMBER = 1e7
 # A number that covers a larger share of a mask must be the background.
 LARGEST = 0.5
-# Keys of a camera's file that do not matter for rectified images.
-_UNUSED = ("header", "distortion_model", "R", "r", "P", "p", "binning_x", "binning_y", "roi", "frame_id")
-_CAMERA_KEYS = ("width", "height", "K", "D", "T_world_camera")
+# Keys of a camera's file that do not matter.
+_UNUSED = ("header", "R", "r", "P", "p", "binning_x", "binning_y", "roi", "frame_id")
+_CAMERA_KEYS = ("width", "height", "K", "D", "distortion_model", "T_world_camera")
 
 
 def load_depth(path: PathLike) -> Float[np.ndarray, "h w"]:
@@ -44,7 +45,7 @@ def load_depth(path: PathLike) -> Float[np.ndarray, "h w"]:
     Raises:
       InputError: the file cannot be read, or is not a depth image.
     """
-    image = _pixels(path)
+    image = load_pixels(path)
     if image.ndim != 2:
         raise InputError(f"{path}: has {image.shape[-1]} channels; a depth image has one")
     if image.dtype.kind == "f":
@@ -64,7 +65,7 @@ def load_colour(path: PathLike) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
       InputError: the file cannot be read, or is not a colour image.
     """
-    image = _pixels(path)
+    image = load_pixels(path)
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or image.dtype != np.uint8:
         raise InputError(
             f"{path}: holds {image.dtype} of shape {image.shape}; give red, green and blue with 8 bits each"
@@ -85,7 +86,7 @@ def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], 
     Raises:
       InputError: the file cannot be read, is not a mask, or has too many objects.
     """
-    image = _pixels(path)
+    image = load_pixels(path)
     if image.ndim != 2 or image.dtype.kind not in "iu":
         raise InputError(f"{path}: holds {image.dtype} of shape {image.shape}; a mask has one whole number a pixel")
     numbers, count = np.unique(image, return_counts=True)
@@ -112,7 +113,19 @@ def load_camera(path: PathLike) -> Camera:
     of the robot's base; the camera's frame has x right, y down, z forward (ROS: the optical frame).
 
     Raises:
-      InputError: the file cannot be read, or a field is missing, unknown or impossible, or the lens distorts.
+      InputError: as `load_lens`, or the lens distorts.
+    """
+    lens = load_lens(path)
+    if lens.distorts:
+        raise InputError(f"{path}: D says that the lens distorts; read it with load_lens, which undistorts its images")
+    return lens.camera
+
+
+def load_lens(path: PathLike) -> Lens:
+    """Read a camera as `load_camera` does, with the distortion of its lens: `D`, and `distortion_model`.
+
+    Raises:
+      InputError: the file cannot be read, or a field is missing, unknown or impossible, or the lens is a fisheye.
     """
     value = read_json(path)
     if not isinstance(value, dict):
@@ -127,17 +140,36 @@ def load_camera(path: PathLike) -> Camera:
     for key in ("width", "height"):
         if type(value[key]) is not int or not 0 < value[key] <= 2**15:
             raise InputError(f"{path}: {key} must be a whole number of pixels, not {shown(value[key])}")
-    if np.any(_numbers(value.get("D", []), None, "D", path)):
-        raise InputError(f"{path}: D says that the lens distorts; give images that are rectified, and D of zeros")
-    K, T = _numbers(value["K"], (3, 3), "K", path), _numbers(value["T_world_camera"], (4, 4), "T_world_camera", path)
+    model = value.get("distortion_model", "")
+    if not isinstance(model, str):
+        raise InputError(f"{path}: distortion_model must be a name, not {shown(model)}")
+    distortion = distortion_of(model, number_array(value.get("D", []), None, "D", path).ravel().tolist(), str(path))
+    K, T = (number_array(value[key], shape, key, path) for key, shape in (("K", (3, 3)), ("T_world_camera", (4, 4))))
     if not np.allclose(T[3], (0, 0, 0, 1)):
         raise InputError(f"{path}: T_world_camera: its last row must be 0 0 0 1; is it transposed?")
+    return Lens(camera_of(value["width"], value["height"], K, T, path), distortion)
+
+
+def camera_of(
+    width: int, height: int, K: Float[np.ndarray, "3 3"], T: Float[np.ndarray, "4 4"], where: PathLike
+) -> Camera:
+    """A camera of matrices.
+
+    Args:
+      width, height: of its images.
+      K: intrinsics; the centre of the first pixel is at 0.
+      T: `T_world_camera` [m].
+      where: the file, for errors.
+
+    Raises:
+      InputError: it is impossible.
+    """
     if abs(K[0, 1]) > 1e-6 or abs(K[1, 0]) > 1e-6:
-        raise InputError(f"{path}: K: pixels must not be skewed")
+        raise InputError(f"{where}: K: pixels must not be skewed")
     try:
         return Camera(
-            width=value["width"],
-            height=value["height"],
+            width=width,
+            height=height,
             fx=float(K[0, 0]),
             fy=float(K[1, 1]),
             cx=float(K[0, 2]) + 0.5,
@@ -146,7 +178,7 @@ def load_camera(path: PathLike) -> Camera:
             position=(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])),
         )
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{where}: {error}") from None
 
 
 def save_depth(depth: Float[np.ndarray, "h w"], path: PathLike) -> None:
@@ -177,8 +209,8 @@ def save_mask(mask: Int[np.ndarray, "h w"], path: PathLike, background: int = 25
     _save_png(np.where(mask < 0, background, mask).astype(np.uint8), path)
 
 
-def save_camera(camera: Camera, path: PathLike) -> None:
-    """Write a camera's file for `load_camera`.
+def save_camera(camera: Camera, path: PathLike, distortion: tuple[float, ...] = ()) -> None:
+    """Write a camera's file for `load_camera`, or for `load_lens` with the `distortion` of a `Lens`.
 
     Raises:
       InputError: the file cannot be written.
@@ -188,7 +220,7 @@ def save_camera(camera: Camera, path: PathLike) -> None:
         "width": camera.width,
         "height": camera.height,
         "K": [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0],
-        "D": [0.0, 0.0, 0.0, 0.0, 0.0],
+        "D": list(distortion or (0.0,) * 5),
         "T_world_camera": [*rows, [0.0, 0.0, 0.0, 1.0]],
     }
     save_json(value, path)
@@ -201,8 +233,12 @@ def _save_png(image: np.ndarray, path: PathLike) -> None:
         file.write(buffer.getvalue())
 
 
-def _pixels(path: PathLike) -> np.ndarray:
-    """The pixels of an image file, in its type."""
+def load_pixels(path: PathLike) -> np.ndarray:
+    """The pixels of an image file, in its type.
+
+    Raises:
+      InputError: the file cannot be read, or is no image.
+    """
     data = read_bytes(path, IMAGE_LIMIT)
     try:
         with warnings.catch_warnings():
@@ -229,14 +265,18 @@ def _picture(data: bytes) -> np.ndarray:
         return np.asarray(image)
 
 
-def _numbers(value: Any, shape: tuple[int, ...] | None, key: str, path: PathLike) -> np.ndarray:
-    """Numbers of a shape, given as nested lists or row by row."""
+def number_array(value: Any, shape: tuple[int, ...] | None, key: str, path: PathLike) -> np.ndarray:
+    """Numbers of a shape, given as nested lists or row by row.
+
+    Raises:
+      InputError: they are others, naming the key and the path.
+    """
     try:
         array = np.array(value, float)
         array = array if shape is None else array.reshape(shape)
         if array.size and not float(np.abs(array).max()) < LARGEST_NUMBER:
             raise ValueError
     except (ValueError, TypeError, OverflowError):
-        size = "" if shape is None else f"{math.prod(shape)} "
-        raise InputError(f"{path}: {key} must be {size}numbers, not {shown(value)}") from None
+        size = "numbers" if shape is None else f"{math.prod(shape)} numbers" if shape else "a number"
+        raise InputError(f"{path}: {key} must be {size}, not {shown(value)}") from None
     return array

@@ -5,11 +5,15 @@ Black, shiny and transparent things, shadows of a stereo camera and mirrors have
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.images.cloud import View
 from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.detector import longer
 
@@ -88,3 +92,24 @@ def beside(share: Float[Array, "h w"]) -> Float[Array, "h w"]:
 def unmeasured(share: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
     """Which pixels were mostly not measured."""
     return share < MOSTLY
+
+
+def median_depth(frames: Sequence[Float[np.ndarray, "h w"]]) -> Float[np.ndarray, "h w"]:
+    """One depth image of several frames of the same view: each pixel's median, 0 where fewer than half measured it.
+
+    Of an even number it is the nearer of the two in the middle, so that no depth between two surfaces arises.
+
+    Args:
+      frames: at least one, along the camera's z [m]; what counts as measured is in `camera.measured`.
+
+    Raises:
+      InputError: their sizes differ.
+    """
+    sizes = list(dict.fromkeys(frame.shape for frame in frames))
+    if len(sizes) > 1:
+        raise InputError(f"depth images: frames of one look must have the same size, not {sizes[0]} and {sizes[1]}")
+    stack = np.stack(frames).astype(np.float32)
+    stack = np.sort(np.where(measured(stack), stack, np.float32(np.nan)), axis=0)
+    count = np.sum(~np.isnan(stack), axis=0, keepdims=True)
+    middle = np.take_along_axis(stack, np.maximum(count - 1, 0) // 2, axis=0)
+    return np.where(2 * count >= len(frames), middle, np.float32(0.0))[0]

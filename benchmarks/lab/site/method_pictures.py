@@ -82,6 +82,7 @@ def maps(recording: Recording) -> Figure:
 def recognition() -> Figure:
     """The shipped depth image, and the shapes that are recognised in it over the colour image."""
     images = ms.example_images()
+    assert images.colour is not None
     problem = ms.build_problem(target=ms.Target.cylinder(), camera=images.camera)
     seen = ms.Recogniser(problem)(jax.random.key(0), images.depth, images.colour)
     scene = jax.tree.map(np.asarray, seen.objects)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mechsearch_jax.commands.options import ConfigFile, settings_of
+from mechsearch_jax.commands.options import ConfigFile, base_of, settings_of
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.workspace.camera import Camera
+    from mechsearch_jax.images.lens import Lens
     from mechsearch_jax.workspace.shelf import Shelf
 
 # Largest turn of a shelf that stays as it is when the shelf's place is corrected, for its faces are axis-aligned [rad].
@@ -34,7 +34,8 @@ def calibrate(
 
     Args:
       depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
-      camera: JSON with the fields of a ROS CameraInfo and T_world_camera; the configuration's camera if not given.
+      camera: JSON with the fields of a ROS CameraInfo and T_world_camera, whose lens may distort; the configuration's
+        camera if not given.
       config: file of settings, of which the shelf is taken, and the camera.
       moved: what is off and is corrected: the camera's pose, or the place of the shelf.
       out: file for the correction: the configuration with the corrected pose (.toml), or the camera (.json).
@@ -43,7 +44,8 @@ def calibrate(
     from mechsearch_jax.calibration.fit import fit_shelf
     from mechsearch_jax.calibration.report import report
     from mechsearch_jax.images.checks import check_images
-    from mechsearch_jax.images.image_files import load_camera, load_depth
+    from mechsearch_jax.images.image_files import load_depth, load_lens
+    from mechsearch_jax.images.lens import Lens
     from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.workspace.sight import check_camera
 
@@ -51,8 +53,12 @@ def calibrate(
     if out is not None and out.suffix.lower() not in suffixes:
         raise InputError(f"calibrate: --out {out} must end in {' or '.join(suffixes)}")
     workcell = settings_of(config).workcell
-    given, shelf = workcell.camera if camera is None else load_camera(camera), workcell.shelf
-    image = load_depth(depth)
+    lens, shelf = Lens(workcell.camera) if camera is None else load_lens(camera), workcell.shelf
+    if lens.distorts and out is not None and out.suffix.lower() == ".toml" and moved == "camera":
+        raise InputError(
+            f"calibrate: the lens of {camera} distorts, and a configuration has none; give --out FILE.json"
+        )
+    given, image = lens.camera, lens.depth(load_depth(depth))
     if out is not None:
         check_writable(out.parent)
     check_camera(given, shelf)
@@ -69,20 +75,21 @@ def calibrate(
             )
         _write_shelf(shelf.moved(tuple((-fit.shift).tolist())), config, out)
     else:
-        _write_camera(fit.corrected, config, out, whole=camera is not None)
+        _write_camera(Lens(fit.corrected, lens.distortion), config, out, whole=camera is not None)
 
 
-def _write_camera(corrected: Camera, config: Path | None, out: Path | None, whole: bool) -> None:
+def _write_camera(lens: Lens, config: Path | None, out: Path | None, whole: bool) -> None:
     """Write a camera; `whole` with its intrinsics, which the configuration may not have."""
     from mechsearch_jax.images.image_files import save_camera
 
     if out is None:
         return
     if out.suffix.lower() == ".json":
-        save_camera(corrected, out)
+        save_camera(lens.camera, out, lens.distortion)
         print(out)
         return
-    base = _base(config)
+    corrected = lens.camera
+    base = base_of(config)
     position = [round(a + b, 7) for a, b in zip(corrected.position, base, strict=True)]
     rotation = [[round(value, 9) for value in row] for row in corrected.rotation]
     sizes = {name: getattr(corrected, name) for name in ("width", "height", "fx", "fy", "cx", "cy")} if whole else {}
@@ -93,20 +100,12 @@ def _write_shelf(shelf: Shelf, config: Path | None, out: Path | None) -> None:
     """Write the place of a shelf."""
     if out is None:
         return
-    x, y, z = _base(config)
+    x, y, z = base_of(config)
     moved = shelf.moved((x, y, z))
     names = ("front", "back", "right", "left", "board", "ceiling", "spawn_x", "spawn_y")
     values = {name: getattr(moved, name) for name in names}
     rounded = {k: round(v, 5) if isinstance(v, float) else [round(a, 5) for a in v] for k, v in values.items()}
     _write_values(config, out, "shelf", rounded)
-
-
-def _base(config: Path | None) -> tuple[float, float, float]:
-    """Where the robot's base stands in the file's frame [m]."""
-    from mechsearch_jax.problem.settings import Base
-    from mechsearch_jax.runtime.tables import read_document, with_table
-
-    return Base().position if config is None else with_table(read_document(config), "base", Base()).position
 
 
 def _write_values(config: Path | None, out: Path, table: str, values: Mapping[str, object]) -> None:
