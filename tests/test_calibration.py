@@ -16,7 +16,7 @@ from mechsearch_jax.calibration.report import correction, report
 from mechsearch_jax.commands.cell.calibrate import _write_values
 from mechsearch_jax.images.camera_pose import with_pose
 from mechsearch_jax.images.examples import example_images
-from mechsearch_jax.images.image_files import load_camera, save_camera, save_depth
+from mechsearch_jax.images.image_files import load_camera, load_lens, save_camera, save_depth
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.tables import with_values
@@ -222,6 +222,39 @@ def test_a_camera_file_is_corrected(tmp_path, monkeypatch, capsys):
         2,
         [f"mechsearch: calibrate: --out {tmp_path}/new.txt must end in .toml or .json"],
     )
+
+
+def test_images_of_a_lens_that_distorts_are_undistorted_and_the_lens_is_kept(tmp_path, monkeypatch):
+    D = (-0.12, 0.02, 0.001, -0.0005, 0.0)
+    save_depth(raw(DEPTH, CAMERA, D), tmp_path / "depth.png")
+    save_camera(off_by((0.01, -0.01, 0.01), degrees=1.0), tmp_path / "camera.json", D)
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
+    assert program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "new.json")) == (0, "")
+    lens = load_lens(tmp_path / "new.json")
+    assert lens.distortion == D
+    assert between(lens.camera, CAMERA)[0] < 0.003
+    status, message = program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "new.toml"))
+    assert status == 2
+    assert "distorts, and a configuration has none; give --out FILE.json" in message
+
+
+def raw(image, camera, D):
+    """What a lens makes of a pinhole camera's image, its inverse found by iteration."""
+    k1, k2, p1, p2, k3 = D
+    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    x = u = (columns - camera.cx) / camera.fx
+    y = v = (rows - camera.cy) / camera.fy
+    for _ in range(50):
+        s = x * x + y * y
+        radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
+        x, y = (
+            (u - 2 * p1 * x * y - p2 * (s + 2 * x * x)) / radial,
+            (v - p1 * (s + 2 * y * y) - 2 * p2 * x * y) / radial,
+        )
+    row, column = np.floor(y * camera.fy + camera.cy).astype(int), np.floor(x * camera.fx + camera.cx).astype(int)
+    inside = (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    found = image[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+    return np.where(inside.reshape(inside.shape + (1,) * (image.ndim - 2)), found, 0).astype(image.dtype)
 
 
 CONFIG = """# My cell.

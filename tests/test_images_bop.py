@@ -2,6 +2,7 @@
 
 import json
 import types
+import warnings
 
 import numpy as np
 import pytest
@@ -76,6 +77,12 @@ def test_of_too_many_objects_the_largest_and_the_target_stay(tmp_path):
         pytest.warns(Note, match="3 smallest are left out"),
     ):
         assert bop_image(folder, target=40).target_id == -1
+
+
+def test_a_target_that_is_said_not_to_show_needs_no_note(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert bop_image(scene(tmp_path, {"0": {"cam_K": K, **POSE}}), target=-1).target_id == -1
 
 
 def test_without_colours_or_masks_there_are_none(tmp_path):

@@ -42,8 +42,8 @@ def bop_image(
       folder: of the scene, in which `scene_camera.json` is.
       number: of the image; None where the scene has but one.
       camera: its pose is taken where the scene has none. Otherwise the frame of the scene is that of the robot's base.
-      target: the target's number in the names of the mask's files, as in `scene_gt.json`; the images' `target_id` is
-        its number in the mask, -1 where it does not show.
+      target: the target's number in the names of the mask's files, as in `scene_gt.json`; negative where it is known
+        not to show. The images' `target_id` is its number in the mask, -1 where it does not show.
 
     Raises:
       InputError: a file is missing or cannot be used, or nothing says where the camera is.
@@ -113,7 +113,7 @@ def _mask(
         if not tail.isdigit() or image.shape[:2] != shape:
             raise InputError(f"{path}: is no mask of shape {shape}, called {number:06d}_NUMBER; it is {image.shape}")
         shapes[int(tail)] = (image if image.ndim == 2 else image[..., 0]) > 0
-    if target is not None and not shapes.get(target, np.zeros(1, bool)).any():
+    if target is not None and target >= 0 and not shapes.get(target, np.zeros(1, bool)).any():
         warnings.warn(
             Note(f"{scene}: image {number} has no mask that shows the target's number {shown(target)}: not seen"),
             stacklevel=3,
