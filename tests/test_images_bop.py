@@ -63,7 +63,7 @@ def test_images_masks_and_camera_of_a_scene(tmp_path):
 
 def test_of_too_many_objects_the_largest_and_the_target_stay(tmp_path):
     folder = scene(tmp_path, {"0": {"cam_K": K, **POSE}}, masks=12)
-    with pytest.warns(Note, match="has 12 objects; the 3 smallest are left out"):
+    with pytest.warns(Note, match="shows 12 objects; the 3 smallest are left out"):
         images = bop_image(folder)
     assert images.mask.max() == 8
     assert (images.mask[9:] == OTHER).all()

@@ -145,6 +145,11 @@ def test_a_lens_that_is_not_understood_is_refused(model, D, words):
         distortion_of(model, D, "camera")
 
 
+def test_a_lens_has_no_more_numbers_than_are_understood():
+    with pytest.raises(InputError, match="Lens: distortion has 12 numbers"):
+        Lens(CAMERA, (0.1,) * 12)
+
+
 def test_a_file_of_a_camera_keeps_its_lens(tmp_path):
     path = tmp_path / "camera.json"
     save_camera(CAMERA, path, LENSES["rational"])

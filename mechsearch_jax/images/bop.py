@@ -120,12 +120,11 @@ def _mask(
         )
     by_size = sorted(shapes, key=lambda each: (each != target, -int(shapes[each].sum())))
     kept = sorted(by_size[:most])
-    if len(kept) < len(shapes):
-        left = len(shapes) - len(kept)
-        warnings.warn(
-            Note(f"{scene}: image {number} has {len(shapes)} objects; the {left} smallest are left out"), stacklevel=3
-        )
+    showing = [each for each in shapes if shapes[each].any()]
+    if left := len(set(showing) - set(kept)):
+        says = f"{scene}: image {number} shows {len(showing)} objects; the {left} smallest are left out"
+        warnings.warn(Note(says), stacklevel=3)
     mask = np.full(shape, OTHER, np.int8)
     for new, old in enumerate(kept):
         mask[shapes[old]] = new
-    return mask, {old: new for new, old in enumerate(kept) if shapes[old].any()}
+    return mask, {old: new for new, old in enumerate(kept) if old in showing}

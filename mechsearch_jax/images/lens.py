@@ -19,6 +19,7 @@ from mechsearch_jax.workspace.camera import Camera
 
 # The models of a ROS `CameraInfo` that are understood, and how many numbers `D` has in each.
 MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
+NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # Models in which zeros are no pinhole camera either.
 FISHEYE = ("equidistant", "fisheye")
 # Radii at which is looked for where a lens maps two rays to one place.
@@ -34,10 +35,17 @@ class Lens:
     Attributes:
       camera: of the undistorted images; the lens's own intrinsics and pose.
       distortion: k1, k2, p1, p2, k3, k4, k5, k6, or the first of them; without any there is no distortion.
+
+    Raises:
+      InputError: there are more.
     """
 
     camera: Camera
     distortion: tuple[float, ...] = ()
+
+    def __post_init__(self):
+        if len(self.distortion) > len(NAMES):
+            raise InputError(f"Lens: distortion has {len(self.distortion)} numbers; it may have {', '.join(NAMES)}")
 
     @property
     def distorts(self) -> bool:
