@@ -25,13 +25,12 @@ from mechsearch_jax.perception.plausibility import (
     shows_nothing,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, Setting
-from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.sight import camera_faults
 
 
-def view_warnings(workcell: Workcell, recogniser: Any) -> tuple[str, ...]:
+def view_warnings(workcell: Setting, recogniser: Any) -> tuple[str, ...]:
     """Warnings about the camera's pose and its distance from the views that the networks were trained on."""
     faults = camera_faults(workcell.camera, workcell.shelf)
     # Another recogniser may have other networks, or none.

@@ -1,5 +1,5 @@
-"""`mechsearch bench`: how long the parts take, and whether whole episodes come to less than before."""
+"""`mechsearch bench`: how long the parts take, what is recognised in real images, whether episodes come to less."""
 
-from mechsearch_jax.commands.bench import episodes, timing
+from mechsearch_jax.commands.bench import episodes, real, timing
 
-COMMANDS = {**timing.COMMANDS, **episodes.COMMANDS}
+COMMANDS = {**timing.COMMANDS, **real.COMMANDS, **episodes.COMMANDS}
