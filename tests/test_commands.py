@@ -239,6 +239,7 @@ WRONG = {
     ),
     "nothing to scale": (["bench", "scaling"], "give --workers, --shards or --ray"),
     "no workers to scale": (["bench", "scaling", "--workers", "1", "0"], "--workers 0 must be at least 1"),
+    "no real scenes": (["bench", "real", "none"], "none: holds no scenes; name a folder"),
     "no rows to report": (["bench", "report", "--rows", "0"], "--rows 0 must be at least 1"),
     "nothing to agree on": (["lab", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "nothing to learn from": (["train", "recognition", "--out", "new", "--batch", "0"], "--batch 0 must be at least 1"),

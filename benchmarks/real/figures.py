@@ -48,7 +48,7 @@ class Look:
         """Whether all things are matched, and all bodies."""
         return all(t.iou >= MATCHED for t in self.things) and all(body.thing is not None for body in self.bodies)
 
-    def fitted(self, value: Callable[[Any], float], among: Callable[[Thing], bool] = lambda _: True) -> list[float]:
+    def fitted(self, value: Callable[[Any], Any], among: Callable[[Thing], bool] = lambda _: True) -> list[Any]:
         """A value of each matched thing among some."""
         return [value(thing) for thing in self.things if thing.median is not None and among(thing)]
 
@@ -145,7 +145,7 @@ class Value(NamedTuple):
 
     value: float | None
     interval: tuple[float, float] | None
-    count: int
+    values: int
 
 
 def value_of(figure: Figure, looks: Sequence[Look]) -> Value:

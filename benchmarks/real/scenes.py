@@ -62,9 +62,9 @@ class LabelledScene:
             return self.camera, shelf
         camera = ahead(self.camera)
         x, y, _ = camera.position
-        sides = {"right": y - WIDE, "left": y + WIDE, "board": self.board, "ceiling": self.board + HIGH}
+        sides = (y - WIDE, y + WIDE, self.board, self.board + HIGH)
         ends = sorted(range(-STEPS, STEPS + 1), key=lambda step: (abs(step), -step))
-        tables = [Shelf(front=x + NEAR, back=x + FAR + 0.02 * step, **sides) for step in ends]
+        tables = [Shelf(x + NEAR, x + FAR + 0.02 * step, *sides) for step in ends]
         return camera, next((t for t in tables if thinned_view(camera, t).camera.height in ROWS), tables[0])
 
 
@@ -104,7 +104,7 @@ def _arrays(file: Path) -> LabelledScene | None:
             parts = dict(stored)
         camera, notes = (json.loads(str(parts.get(name, "{}"))) for name in ("camera", "notes"))
         depth, width, height = parts["depth"].astype(np.float32) / 1e4, camera["width"], camera["height"]
-        matrices = [number_array(camera[key], (n, n), key, file) for key, n in (("K", 3), ("T_world_camera", 4))]
+        K, T = (number_array(camera[key], (n, n), key, file) for key, n in (("K", 3), ("T_world_camera", 4)))
         category = str(notes.get("category", file.parent.name))
     except (OSError, ValueError, KeyError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(f"{file}: is no labelled depth image ({' '.join(str(error).split())})") from error
@@ -114,9 +114,7 @@ def _arrays(file: Path) -> LabelledScene | None:
         raise InputError(f"{file}: D says that the lens distorts; give images that are rectified")
     colour = load_colour(picture) if is_file(picture := file.with_suffix(".jpg")) else None
     mask = np.where(parts["mask"] == 255, -1, parts["mask"].astype(int))
-    return _fitting(
-        file, LabelledScene(category, camera_of(width, height, *matrices, file), BOARD, depth, colour, mask)
-    )
+    return _fitting(file, LabelledScene(category, camera_of(width, height, K, T, file), BOARD, depth, colour, mask))
 
 
 def _bop(scene: Path, number: int) -> LabelledScene | None:

@@ -36,7 +36,7 @@ SPLIT, MERGED = 0.2, 0.4
 # A thing's foot is hidden if so much of its lower edge borders, within so many pixels, on what is so much nearer [m].
 HIDDEN, BORDER, NEARER = 0.3, 10, 0.015
 # Of each thing so many points are compared with surfaces, of which points are six squares of such sides.
-SAMPLE, GRID = 2500, 64
+SAMPLE, GRID = 2500, 128
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ def scored(
     numbers, pixels = np.unique(scene.mask[space & (scene.mask >= 0)], return_counts=True)
     numbers = numbers[pixels >= PIXELS]
     slots = np.flatnonzero(np.asarray(observation.objects.valid))
-    bodies = [jax.tree.map(lambda a, k=k: np.asarray(a)[k : k + 1], observation.objects) for k in slots]
+    bodies = [jax.tree.map(lambda a, k=k: jnp.asarray(np.asarray(a)[k : k + 1]), observation.objects) for k in slots]
     enter = np.asarray(_depths(camera, observation.objects))[slots]
     early = (scene.depth - enter) * np.linalg.norm(way, axis=-1) > AHEAD
 
@@ -172,26 +172,27 @@ def distances(body: Superquadrics, points: Float[np.ndarray, "p 3"]) -> Float[np
 
     From the tangent plane at the nearest of many points of the surface; beyond an edge from that point.
     """
-    best = np.full(len(points), np.inf)
-    parts = world_parts(body)
-    for surface, normal, valid in zip(*(np.asarray(a) for a in _surface(parts)), np.asarray(parts.valid), strict=True):
+    u, v = (a.ravel() for a in np.meshgrid(*[np.linspace(-1.0, 1.0, GRID)] * 2))
+    faces = [np.insert(np.stack([u, v], axis=1), axis, side, axis=1) for axis in range(3) for side in (-1.0, 1.0)]
+    parts, best = world_parts(body), np.full(len(points), np.inf)
+    surfaces = _surface(parts, jnp.asarray(np.concatenate(faces), jnp.float32))
+    for surface, normal, valid in zip(*(np.asarray(a) for a in (*surfaces, parts.valid)), strict=True):
         straight, nearest = KDTree(surface).query(points)
         along = np.abs(np.sum((points - surface[nearest]) * normal[nearest], axis=1))
         beside = np.sqrt(np.maximum(straight**2 - along**2, 0.0))
-        near = beside < 1.5 * np.ptp(surface, axis=0).max() / GRID
+        near = beside < np.ptp(surface, axis=0).max() / GRID
         best = np.minimum(best, np.where(near, along, straight)) if valid else best
     return best
 
 
 @jax.jit
-def _surface(parts: Superquadrics) -> tuple[Float[Array, "n points 3"], Float[Array, "n points 3"]]:
-    """Points of each superquadric's surface, and the normals there, in the world."""
-    u, v = (a.reshape(-1) for a in np.meshgrid(*[np.linspace(-1.0, 1.0, GRID)] * 2))
-    faces = [np.insert(np.stack([u, v], axis=1), axis, side, axis=1) for axis in range(3) for side in (-1.0, 1.0)]
-    cube = jnp.asarray(np.concatenate(faces), jnp.float32)
+def _surface(
+    parts: Superquadrics, cube: Float[Array, "points 3"]
+) -> tuple[Float[Array, "n points 3"], Float[Array, "n points 3"]]:
+    """Points of each superquadric's surface in the directions of a cube's points, and the normals, in the world."""
 
     def one(part):
-        surface = superquadric.towards(part.size, part.exponents, cube)
+        surface = jax.vmap(superquadric.towards, (None, None, 0))(part.size, part.exponents, cube)
         slope = jax.vmap(jax.grad(lambda point: superquadric.gauge(part.size, part.exponents, point)))(surface)
         normal = slope / jnp.linalg.norm(slope, axis=-1, keepdims=True)
         return surface @ part.rotation.T + part.position[None], normal @ part.rotation.T

@@ -11,9 +11,10 @@ from mechsearch_jax.commands.options import ConfigFile
 from mechsearch_jax.runtime.errors import InputError
 
 Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+Out = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
 
 
-def bench_real(folder: Folder, /, *, shelf: ConfigFile = None, out: Path | None = None) -> None:
+def bench_real(folder: Folder, /, *, shelf: ConfigFile = None, out: Out = None) -> None:
     """Measure recognition on labelled real depth images, from depth and colour and with the true masks: matched, split
     and merged things, phantoms, distances from surfaces, how bodies stand, confidence, doubt and time.
 
