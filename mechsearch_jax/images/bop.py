@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from mechsearch_jax.images.examples import Images
 from mechsearch_jax.images.image_files import MILLIMETRE, camera_of, load_colour, load_depth, load_pixels, number_array
@@ -26,7 +26,7 @@ SCENE = "scene_camera.json"
 
 def bop_images(folder: PathLike, *, camera: Camera | None = None, target: int | None = None) -> Iterator[Images]:
     """The images of a BOP scene one after the other, each read when it is asked for: `bop_image` of every number."""
-    for number in _entries(Path(folder)):
+    for number in entries(Path(folder)):
         yield bop_image(folder, number, camera=camera, target=target)
 
 
@@ -49,13 +49,13 @@ def bop_image(
       InputError: a file is missing or cannot be used, or nothing says where the camera is.
     """
     scene = Path(folder)
-    entries = _entries(scene)
-    if number not in entries:
-        if number is not None or len(entries) != 1:
+    known = entries(scene)
+    if number not in known:
+        if number is not None or len(known) != 1:
             what = "several images; say which" if number is None else f"no image {number}"
-            raise InputError(f"{scene / SCENE}: has {what} (it has {len(entries)}, {min(entries)} to {max(entries)})")
-        (number,) = entries
-    entry, where = entries[number], f"{scene / SCENE}: image {number}"
+            raise InputError(f"{scene / SCENE}: has {what} (it has {len(known)}, {min(known)} to {max(known)})")
+        (number,) = known
+    entry, where = known[number], f"{scene / SCENE}: image {number}"
     scale = float(number_array(entry.get("depth_scale", 1.0), (), "depth_scale", where))
     if scale <= 0.0:
         raise InputError(f"{where}: depth_scale {scale:g} must be more than 0")
@@ -72,7 +72,12 @@ def bop_image(
     )
 
 
-def _entries(scene: Path) -> dict[int, dict[str, Any]]:
+def entries(scene: Path) -> dict[int, dict[str, Any]]:
+    """The entry of each image in a scene's `scene_camera.json`, by the image's number.
+
+    Raises:
+      InputError: the file cannot be read, or is another one.
+    """
     value = read_json(scene / SCENE)
     good = isinstance(value, dict) and value and all(isinstance(entry, dict) for entry in value.values())
     if not good or not all(name.isascii() and name.isdigit() and len(name) < 10 for name in value):
@@ -102,17 +107,27 @@ def _camera(entry: dict[str, Any], shape: tuple[int, ...], camera: Camera | None
     return camera_of(shape[1], shape[0], K, T, where)
 
 
-def _mask(
-    scene: Path, number: int, shape: tuple[int, ...], most: int, target: int | None
-) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
-    """The mask of the objects that show most, and the number in it for each number in a file's name."""
-    shapes: dict[int, np.ndarray] = {}
+def visible_masks(scene: Path, number: int, shape: tuple[int, ...]) -> dict[int, Bool[np.ndarray, "h w"]]:
+    """Which pixels show each object of an image, by the number in the name of its mask's file.
+
+    Raises:
+      InputError: a file is no mask of the image's shape.
+    """
+    shapes = {}
     for path in sorted((scene / "mask_visib").glob(f"{number:06d}_*")):
         tail = path.stem.rpartition("_")[2]
         image = load_pixels(path)
         if not tail.isdigit() or image.shape[:2] != shape:
             raise InputError(f"{path}: is no mask of shape {shape}, called {number:06d}_NUMBER; it is {image.shape}")
         shapes[int(tail)] = (image if image.ndim == 2 else image[..., 0]) > 0
+    return shapes
+
+
+def _mask(
+    scene: Path, number: int, shape: tuple[int, ...], most: int, target: int | None
+) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
+    """The mask of the objects that show most, and the number in it for each number in a file's name."""
+    shapes = visible_masks(scene, number, shape)
     if target is not None and target >= 0 and not shapes.get(target, np.zeros(1, bool)).any():
         warnings.warn(
             Note(f"{scene}: image {number} has no mask that shows the target's number {shown(target)}: not seen"),
