@@ -276,13 +276,14 @@ def test_a_killed_run_goes_on_and_failures_are_drawn(folder, image, tmp_path):
     again = [look for at in looks.looks_at(found, None, tmp_path, maker(image, wrong, calls)) for look in at]
     assert len(calls) == 4
     assert json.loads(json.dumps(dataclasses.asdict(again[0]))) == json.loads(json.dumps(dataclasses.asdict(made[0])))
-    looks.save_results(again, tmp_path / "results.json")
+    of_looks = figures.figures(again)
+    looks.save_results(again, of_looks, tmp_path / "results.json")
     stored = json.loads((tmp_path / "results.json").read_text())
     all_scenes = stored["figures"]["depth and colour"]["all"]
     assert all_scenes["matched"] == {"value": 1.0, "interval": [1.0, 1.0], "values": 8}
     assert list(stored["figures"]["true masks"]) == ["all", "000001", "stacked"]
     assert set(stored["about"]) == set(all_scenes) == set(figures.FIGURES)
-    assert figures.table("true masks", figures.figures(again)["true masks"]).row_count == len(figures.FIGURES)
+    assert figures.table("true masks", of_looks["true masks"]).row_count == len(figures.FIGURES)
     # A table that is right has no picture.
     (tmp_path / "x").mkdir()
     right = list(looks.looks_at({"one": found["arrays/table3"]}, None, tmp_path / "x", maker(image, truth(), calls)))

@@ -11,11 +11,13 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.real.scores import MATCHED, WELL, Body, Thing
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
-from mechsearch_jax.benchmarks.statistics.intervals import RESAMPLES, SEED, with_interval
+from mechsearch_jax.benchmarks.statistics.intervals import SEED, with_interval
 
 Images = Literal["depth and colour", "true masks"]
 # Scenes with more things are told apart: more than the slots that recognition has by default.
 FEW = 8
+# Of the bootstrap.
+RESAMPLES = 500
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,8 +172,12 @@ def groups_of(looks: Sequence[Look]) -> dict[str, list[Look]]:
     return groups | {kind: [look for look in looks if look.category == kind] for kind in kinds if len(kinds) > 1}
 
 
-def figures(looks: Sequence[Look]) -> dict[str, dict[str, dict[str, Value]]]:
-    """Every figure, by what images were given, by group, by name."""
+# By what images were given, by group, by name.
+Figures = Mapping[str, Mapping[str, Mapping[str, Value]]]
+
+
+def figures(looks: Sequence[Look]) -> Figures:
+    """Every figure of looks."""
     given = dict.fromkeys(look.images for look in looks)
     return {
         images: {

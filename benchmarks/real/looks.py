@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mechsearch_jax.benchmarks.real.figures import FIGURES, Images, Look, figures
+from mechsearch_jax.benchmarks.real.figures import FIGURES, Figures, Images, Look
 from mechsearch_jax.benchmarks.real.pictures import save_picture
 from mechsearch_jax.benchmarks.real.scenes import LabelledScene
 from mechsearch_jax.benchmarks.real.scores import Body, Thing, scored
@@ -149,15 +149,15 @@ def _said(cell: Cell, recognise: Any, observation: Observation, *arrays: Any) ->
     return recognition_doubt(cell, observation, images.depth).reason(DoubtConfig()), said
 
 
-def save_results(looks: Sequence[Look], path: Path) -> None:
-    """Write all figures, what each is, and all looks as JSON.
+def save_results(looks: Sequence[Look], of_looks: Figures, path: Path) -> None:
+    """Write looks, their figures and what each is as JSON.
 
     Raises:
       InputError: the file cannot be written.
     """
     values = {
         images: {group: {name: value._asdict() for name, value in of.items()} for group, of in groups.items()}
-        for images, groups in figures(looks).items()
+        for images, groups in of_looks.items()
     }
     about = {name: figure.about for name, figure in FIGURES.items()}
     made_by = {"program": program(), "versions": versions()}

@@ -45,12 +45,13 @@ def bench_real(folder: Folder, /, *, shelf: ConfigFile = None, out: Out = None) 
     made = [look for of_scene in at_each for look in of_scene]
     if not made:
         raise InputError(f"{folder}: none of its {len(scenes)} images has labels")
-    for images, groups in figures.figures(made).items():
+    of_looks = figures.figures(made)
+    for images, groups in of_looks.items():
         console.print(figures.table(images, groups), "")
     if unlabelled := sum(not of_scene for of_scene in at_each):
         console.print(f"{unlabelled} images have no labels and are left out")
     if out is not None:
-        looks.save_results(made, out / "results.json")
+        looks.save_results(made, of_looks, out / "results.json")
         console.print(str(out), soft_wrap=True)
 
 
