@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -83,25 +84,22 @@ def looks_at(
             yield kept[name]
             continue
         scene = read()
-        looks = (
-            []
-            if scene is None
-            else list(_looks(name, scene, Cell(*scene.workspace(shelf), Target.cylinder()), make, out))
-        )
+        looks = [] if scene is None else list(_looks(name, scene, shelf, make, out))
         if path is not None:
             row = {"program": version, "scene": name, "looks": list(map(dataclasses.asdict, looks))}
             with open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps(row, allow_nan=False) + "\n")
+                # A killed run may have left half a line.
+                file.write("\n" + json.dumps(row, allow_nan=False))
         yield looks
 
 
 def _kept(path: Path, version: str) -> dict[str, list[Look]]:
     kept = {}
     for line in read_text(path, LARGEST).splitlines():
-        # A killed run may have left half a line, and the next one behind it.
-        if line.startswith(json.dumps({"program": version})[:-1]) and line.endswith("]}"):
+        with contextlib.suppress(ValueError):
             row = json.loads(line)
-            kept[row["scene"]] = list(map(_look, row["looks"]))
+            if row["program"] == version:
+                kept[row["scene"]] = list(map(_look, row["looks"]))
     return kept
 
 
@@ -110,7 +108,8 @@ def _look(row: dict[str, Any]) -> Look:
     return Look(**{**row, **parts})
 
 
-def _looks(name: str, scene: LabelledScene, cell: Cell, make: Maker, out: Path | None) -> Iterator[Look]:
+def _looks(name: str, scene: LabelledScene, shelf: Shelf | None, make: Maker, out: Path | None) -> Iterator[Look]:
+    cell = Cell(*scene.workspace(shelf), Target.cylinder())
     recognise = make(cell)
     numbers, pixels = np.unique(scene.mask[scene.mask >= 0], return_counts=True)
     # Of more things than slots the smallest are left out.
