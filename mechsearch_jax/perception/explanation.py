@@ -34,12 +34,12 @@ from mechsearch_jax.perception.hypotheses import (
     parts,
     pixels_of,
     standing,
-    together,
 )
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import (
     Costs,
+    Moves,
     Sample,
     Selection,
     check_numbers,
@@ -218,7 +218,7 @@ class _Tried(PyTreeNode):
       image: with pixels of segments without an object as OTHER.
       sample: points and rays of it.
       masks, active, boards: as of `fitted`.
-      chosen, divided, groups: as of `moves_of`.
+      moves: by which they enter an explanation.
     """
 
     image: LabelledImage
@@ -226,9 +226,7 @@ class _Tried(PyTreeNode):
     masks: jax.Array
     active: jax.Array
     boards: jax.Array
-    chosen: jax.Array
-    divided: jax.Array
-    groups: jax.Array
+    moves: Moves
 
 
 def _explain(
@@ -257,11 +255,13 @@ def _explain(
     # First the segments, then what is tried beside them: in a loop, so that the fits are compiled once.
     def step(turn, state):
         fits, given = state
+        more = fit(keys[turn * 2], given)
         # What stands on another object was taken to stand on the board, and is fitted again.
-        both = jax.tree.map(functools.partial(_where, given.active), fit(keys[turn * 2], given), fits)
+        better = given.active & (more.objects.valid | ~fits.objects.valid)
+        both = jax.tree.map(functools.partial(_where, better), more, fits)
         return both, jax.lax.cond(turn == 0, tried, lambda _: given, both)
 
-    masks = jnp.pad(segments, ((0, 2 * WAYS * config.splits + 2 * config.merges), (0, 0), (0, 0)))
+    masks = jnp.pad(segments, ((0, 2 * WAYS * config.splits + config.merges), (0, 0), (0, 0)))
     segmented = {
         "masks": masks,
         "active": jnp.any(masks, axis=(1, 2)),
@@ -274,8 +274,7 @@ def _explain(
         valid=jnp.concatenate([present(fits).valid, fits.objects.valid[SLOTS:] & ~_inside(fits.objects, body)[SLOTS:]])
     )
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), objects, body)
-    moves = moves_of(given.chosen, given.divided, given.groups, config.drops)
-    selection = select_objects(everything, moves, given.sample, pixels_of(given.image.labels), config)
+    selection = select_objects(everything, given.moves, given.sample, pixels_of(given.image.labels), config)
     errors = jnp.append(fits.error, 0.0)
     return _chosen(everything, errors, selection, given.image, fitted_target, given.sample, config)
 
@@ -324,22 +323,20 @@ def _tried(
     parted = jnp.repeat(divided, 2) & (counts > least) & ~of_target
 
     # What something hides in the middle shows two segments that do not border on each other, but whose objects overlap.
-    touching = bordering(image.points, image.labels, config.jump)
+    borders = bordering(image.points, image.labels, config.jump)
     deep = jnp.triu(penetrations(base) - config.touching, 1)
-    likely = jnp.where(touching >= 3, touching, 0.0) + 1e4 * jnp.maximum(deep, 0.0)
+    either = (borders >= 3) & (doubtful[:, None] | doubtful[None])
+    likely = jnp.where(either, borders, 0.0) + 1e4 * jnp.maximum(deep, 0.0)
     likely, pair = jax.lax.top_k(likely.reshape(-1), config.merges)
-    low, high = (end.astype(slots.dtype)[:, None] for end in (pair // SLOTS, pair % SLOTS))
-    pairs = ((slots[None] == low) | (slots[None] == high)) & (likely > 0.0)[:, None]
-    # A wide thing may be in more than two pieces.
-    groups = jnp.concatenate([pairs, together(touching >= 3, base.valid)[: config.merges]])
-    groups = groups & base.valid[None] & (jnp.sum(groups, axis=1) > 1)[:, None]
-    union = jnp.any(groups[:, :, None, None] & segments[None], axis=1)
+    low, high = pair // SLOTS, pair % SLOTS
+    joined = (likely > 0.0) & base.valid[low] & base.valid[high]
+    union = (image.labels[None] == low[:, None, None]) | (image.labels[None] == high[:, None, None])
 
     masks = jnp.concatenate([segments, halves, union])
     boards = standing(masks, base, sample, shelf.board)
     raised = base.valid & (boards[:SLOTS] > shelf.board)
-    active = jnp.concatenate([raised, parted, jnp.any(groups, axis=1)])
-    return _Tried(image, sample, masks, active, boards, chosen, divided, groups)
+    active = jnp.concatenate([raised, parted, joined])
+    return _Tried(image, sample, masks, active, boards, moves_of(chosen, divided, (low, high), joined, config.drops))
 
 
 def _without(labels: Int[Array, "h w"], absent: Bool[Array, " 8"]) -> Int[Array, "h w"]:

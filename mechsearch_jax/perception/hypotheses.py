@@ -122,23 +122,6 @@ def bordering(
     return total
 
 
-def together(touching: Bool[Array, "n n"], valid: Bool[Array, " n"]) -> Bool[Array, "n n"]:
-    """Sets of objects that are connected by touching each other, each once, those of more than two objects first.
-
-    Args:
-      touching: pairs, above the diagonal.
-      valid: which objects there are.
-    """
-    both = (touching | touching.T) & valid[:, None] & valid[None]
-    near = both | jnp.eye(len(valid), dtype=bool)
-    for _ in range(3):
-        near = jnp.any(near[:, :, None] & near[None], axis=1)
-    first = jnp.argmax(near, axis=1) == jnp.arange(len(valid))
-    count = jnp.where(first, jnp.sum(near, axis=1), 0)
-    order = jnp.argsort(-count, stable=True)
-    return near[order] & (count[order] > 2)[:, None]
-
-
 class Fits(PyTreeNode):
     """Objects fitted to masks.
 

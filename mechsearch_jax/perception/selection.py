@@ -40,8 +40,6 @@ class Costs:
       object: price of an object.
       gain: by how much another explanation must be better, and ...
       gain_share: ... by which share of the pixels of the segments that it changes.
-      worse_share: a thing in pieces explains more of its stray points than the whole does: a union may be worse by
-        this share of the pixels of its segments.
       overlap: objects may be so deep in each other, and in the target; recognition's own error.
       overlap_cost: of each further centimetre.
     """
@@ -56,7 +54,6 @@ class Costs:
     object: float = 8.0
     gain: float = 4.0
     gain_share: float = 0.01
-    worse_share: float = 0.01
     overlap: float = 0.01
     overlap_cost: float = 20.0
 
@@ -151,8 +148,7 @@ def passed(scene: Superquadrics, sample: Sample, costs: Costs) -> Float[Array, "
 
 
 class Moves(PyTreeNode):
-    """Changes of an explanation, each from one set of objects to another, shape (Q, C), which are possible, and which
-    join segments.
+    """Changes of an explanation, each from one set of objects to another, shape (Q, C), and which are possible.
 
     The objects are those of the segments, both parts of every division, the unions, and the target.
     """
@@ -160,32 +156,35 @@ class Moves(PyTreeNode):
     removed: jax.Array
     added: jax.Array
     possible: jax.Array
-    joins: jax.Array
 
 
 def moves_of(
-    chosen: Int[Array, " k"], divided: Bool[Array, " d"], groups: Bool[Array, "m 8"], drops: bool = True
+    chosen: Int[Array, " k"],
+    divided: Bool[Array, " d"],
+    pair: tuple[Array, Array],
+    joined: Bool[Array, " m"],
+    drops: bool = True,
 ) -> Moves:
-    """Divide a segment into two objects or one of them, join a group, or drop an object; the target stays.
+    """Divide a segment into two objects or one of them, join a pair, or drop an object; the target stays.
 
     Args:
       chosen: segments that are divided, each in `WAYS` ways.
       divided: which of the divisions are tried.
-      groups: the segments of each union; those without segments are not tried.
+      pair: first and second segment of each union.
+      joined: which of the unions are tried.
       drops: whether objects are dropped.
     """
-    count, unions = len(divided), len(groups)
-    capacity = SLOTS + 2 * count + unions + 1
+    count = len(divided)
+    capacity = SLOTS + 2 * count + len(joined) + 1
     of_segment = jax.nn.one_hot(jnp.repeat(chosen, WAYS), capacity, dtype=bool)
     first, second = (jax.nn.one_hot(SLOTS + 2 * jnp.arange(count) + i, capacity, dtype=bool) for i in (0, 1))
-    merged = jnp.pad(groups, ((0, 0), (0, capacity - SLOTS)))
-    union = jax.nn.one_hot(SLOTS + 2 * count + jnp.arange(unions), capacity, dtype=bool)
+    merged = [jax.nn.one_hot(slots, capacity, dtype=bool) for slots in pair]
+    union = jax.nn.one_hot(SLOTS + 2 * count + jnp.arange(len(joined)), capacity, dtype=bool)
     each = jnp.eye(capacity, dtype=bool)[:-1]
     return Moves(
-        removed=jnp.concatenate([of_segment, of_segment, of_segment, merged, each]),
+        removed=jnp.concatenate([of_segment, of_segment, of_segment, merged[0] | merged[1], each]),
         added=jnp.concatenate([first | second, first, second, union, jnp.zeros_like(each)]),
-        possible=jnp.concatenate([divided, divided, divided, jnp.any(groups, axis=1), jnp.full(len(each), drops)]),
-        joins=jnp.concatenate([jnp.zeros(3 * count, bool), jnp.ones(unions, bool), jnp.zeros(len(each), bool)]),
+        possible=jnp.concatenate([divided, divided, divided, joined, jnp.full(len(each), drops)]),
     )
 
 
@@ -221,8 +220,7 @@ def select_objects(
 
     # What a change must gain, for those that begin with a segment.
     size = jnp.concatenate([pixels, jnp.zeros(capacity - SLOTS)])
-    changed = jnp.sum(moves.removed * size[None], axis=1)
-    needed = jnp.where(moves.joins, -costs.worse_share * changed, costs.gain + costs.gain_share * changed)
+    needed = costs.gain + costs.gain_share * jnp.sum(moves.removed * size[None], axis=1)
     table = (cost, price, overlap, sample.weight)
 
     def gains_from(selected, present):
