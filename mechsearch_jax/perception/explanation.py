@@ -250,7 +250,8 @@ def _explain(
         return _tried(keys[1], image, present(fits), fitted_target, settings[1:3], config, least)
 
     def fit(key, given):
-        return fitted(key, image, given.masks, given.active, given.boards, *settings)
+        whole = jnp.arange(len(given.masks)) < SLOTS
+        return fitted(key, image, given.masks, given.active, given.boards, whole, *settings)
 
     # First the segments, then what is tried beside them: in a loop, so that the fits are compiled once.
     def step(turn, state):

@@ -142,6 +142,7 @@ def fitted(
     masks: Bool[Array, "c h w"],
     active: Bool[Array, " c"],
     boards: Float[Array, " c"],
+    whole: Bool[Array, " c"],
     shapes: ShapeNetwork,
     camera: Camera,
     shelf: Shelf,
@@ -157,6 +158,7 @@ def fitted(
       image: of the camera.
       masks, active: the pixels of each object, and which are fitted.
       boards: height of what each stands on: it is recognised like an object on a board at that height [m].
+      whole: which masks are whole segments.
       shapes: the network.
       camera, shelf: of the image.
       refinement: static.
@@ -194,7 +196,8 @@ def fitted(
     # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more.
     block = 1 if on_cpu() else SLOTS
     fits = masked_vmap(fit, active, shared, element, (masks, boards, seeds), block=block)
-    doubtful = active & ~(fits.objects.valid & (fits.misfit < DOUBTFUL))
+    # Parts of a segment that are fitted to a few points of it would explain those points well.
+    doubtful = active & whole & ~(fits.objects.valid & (fits.misfit < DOUBTFUL))
     rough = masked_vmap(fit_roughly, doubtful, shared[1:], element, (masks, boards), block=block)
     better = doubtful & rough.objects.valid & ((rough.misfit < BETTER * fits.misfit) | ~fits.objects.valid)
 
