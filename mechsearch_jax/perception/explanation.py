@@ -28,11 +28,14 @@ from mechsearch_jax.perception.confidence import Measures, confidence_of, measur
 from mechsearch_jax.perception.hypotheses import (
     SLOTS,
     WAYS,
+    Fits,
     bordering,
     distinct,
     fitted,
+    mended,
     parts,
     pixels_of,
+    rows_where,
     standing,
 )
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
@@ -250,8 +253,7 @@ def _explain(
         return _tried(keys[1], image, present(fits), fitted_target, settings[1:3], config, least)
 
     def fit(key, given):
-        whole = jnp.arange(len(given.masks)) < SLOTS
-        return fitted(key, image, given.masks, given.active, given.boards, whole, *settings)
+        return fitted(key, image, given.masks, given.active, given.boards, *settings)
 
     # First the segments, then what is tried beside them: in a loop, so that the fits are compiled once.
     def step(turn, state):
@@ -259,7 +261,7 @@ def _explain(
         more = fit(keys[turn * 2], given)
         # What stands on another object was taken to stand on the board, and is fitted again.
         better = given.active & (more.objects.valid | ~fits.objects.valid)
-        both = jax.tree.map(functools.partial(_where, better), more, fits)
+        both = jax.tree.map(functools.partial(rows_where, better), more, fits)
         return both, jax.lax.cond(turn == 0, tried, lambda _: given, both)
 
     masks = jnp.pad(segments, ((0, 2 * WAYS * config.splits + config.merges), (0, 0), (0, 0)))
@@ -276,13 +278,7 @@ def _explain(
     )
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), objects, body)
     selection = select_objects(everything, given.moves, given.sample, pixels_of(given.image.labels), config)
-    errors = jnp.append(fits.error, 0.0)
-    return _chosen(everything, errors, selection, given.image, fitted_target, given.sample, config)
-
-
-def _where(chosen: Bool[Array, " c"], a: Array, b: Array) -> Array:
-    """Rows of `a` where chosen, else of `b`."""
-    return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    return _chosen(fits.replace(objects=objects), given, selection, fitted_target, settings[1:3], config)
 
 
 def _zeros(of: Callable[[], Any]) -> Any:
@@ -358,23 +354,23 @@ def _inside(scene: Superquadrics, body: Superquadrics) -> Bool[Array, " n"]:
 
 
 def _chosen(
-    everything: Superquadrics,
-    errors: Float[Array, " c"],
+    fits: Fits,
+    given: _Tried,
     selection: Selection,
-    image: LabelledImage,
     fitted_target: _FittedTarget,
-    sample: Sample,
+    setting: tuple[Camera, Shelf],
     config: ExplanationConfig,
 ) -> Fitted:
     """The selected objects in eight slots, those of segments that stay in theirs, with the labels of their pixels."""
+    image, sample = given.image, given.sample
     # There may be no hypotheses.
     stays, new = selection.selected[:SLOTS], jnp.pad(selection.selected[SLOTS:-1], (0, SLOTS))
     order = jnp.argsort(~new, stable=True)[:SLOTS]
     free = jnp.cumsum(~stays) - 1
     filled = ~stays & (free < jnp.sum(new))
     source = jnp.where(filled, SLOTS + order[jnp.clip(free, 0, SLOTS - 1)], jnp.arange(SLOTS))
-    scene: Superquadrics = jax.tree.map(lambda a: a[source], everything)
-    scene = scene.replace(valid=stays | filled)
+    fits, boards = jax.tree.map(lambda a: a[source], (fits, given.boards))
+    scene = fits.objects.replace(valid=stays | filled)
 
     # Pixels of segments that are no more go to the nearest of the objects that they lie on. What was no object's, such
     # as an undetected target, stays so.
@@ -385,5 +381,8 @@ def _chosen(
     nearest = jnp.where(jnp.min(near, axis=0) < sample.exact + config.wrong, jnp.argmin(near, axis=0), OTHER)
     nearest = jnp.where(fitted_target.on_it, OTHER, nearest.reshape(labels.shape))
     labels = jnp.where(gone, nearest, labels).astype(labels.dtype)
-    measures = measures_of(scene, labels, image, sample, errors[source], selection.margin[source], config)
+    masks = labels[None] == jnp.arange(SLOTS, dtype=labels.dtype)[:, None, None]
+    fits = mended(fits.replace(objects=scene), image, masks, boards, *setting)
+    scene = fits.objects
+    measures = measures_of(scene, labels, image, sample, fits.error, selection.margin[source], config)
     return Fitted(standard_edges(scene), fitted_target.pose, confidence_of(measures), measures, labels, filled)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -142,14 +143,12 @@ def fitted(
     masks: Bool[Array, "c h w"],
     active: Bool[Array, " c"],
     boards: Float[Array, " c"],
-    whole: Bool[Array, " c"],
     shapes: ShapeNetwork,
     camera: Camera,
     shelf: Shelf,
     refinement: RefinementConfig,
 ) -> Fits:
-    """The object of every mask that is active: the network's, refined, or one around its points where that explains the
-    image much better.
+    """The object of every mask that is active: the network's, refined.
 
     The objects of other masks are not valid.
 
@@ -158,31 +157,56 @@ def fitted(
       image: of the camera.
       masks, active: the pixels of each object, and which are fitted.
       boards: height of what each stands on: it is recognised like an object on a board at that height [m].
-      whole: which masks are whole segments.
       shapes: the network.
       camera, shelf: of the image.
       refinement: static.
     """
     network = shapes.network
 
-    def alone_in(labels, mask):
-        return jnp.where(mask, 0, jnp.where(labels >= 0, labels + 1, labels)).astype(jnp.int8)
-
     def fit(shared, element, row):
         parameters, camera, shelf = shared
         points, depth, labels = element
         mask, board, seed = row
-        alone, shelf = alone_in(labels, mask), dataclasses.replace(shelf, board=board)
+        alone, shelf = _alone(labels, mask), dataclasses.replace(shelf, board=board)
         key = jax.random.key(seed)
         scene, error = recognise_with_error(key, network, parameters, camera, points, alone, shelf, 1)
         refined = refine(camera, shelf, scene, points.reshape(-1, 3), alone.reshape(-1), depth, refinement)
         return jax.tree.map(lambda a: a[0], Fits(refined.scene, error, refined.misfit))
 
-    def fit_roughly(shared, element, row):
+    seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
+    shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
+    # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more.
+    block = 1 if on_cpu() else SLOTS
+    fits = masked_vmap(fit, active, shared, element, (masks, boards, seeds), block=block)
+    objects = fits.objects.replace(
+        valid=fits.objects.valid & active, size=jnp.where(active[:, None], fits.objects.size, 0.01)
+    )
+    return fits.replace(objects=objects)
+
+
+def mended(
+    fits: Fits,
+    image: LabelledImage,
+    masks: Bool[Array, "c h w"],
+    boards: Float[Array, " c"],
+    camera: Camera,
+    shelf: Shelf,
+) -> Fits:
+    """Objects of which those that explain little are fitted around their points alone, where that explains much more.
+
+    Args:
+      fits: the objects.
+      image: of the camera.
+      masks: their pixels.
+      boards: height of what each stands on [m].
+      camera, shelf: of the image.
+    """
+
+    def fit(shared, element, row):
         camera, shelf = shared
         points, depth, labels = element
         mask, board = row
-        alone, shelf = alone_in(labels, mask).reshape(-1), dataclasses.replace(shelf, board=board)
+        alone, shelf = _alone(labels, mask).reshape(-1), dataclasses.replace(shelf, board=board)
         flat = points.reshape(-1, 3)
         index, weight = select(alone, jnp.int8(0), ROUGH.points)
         guesses = rough_shapes(flat[index], weight > 0.0, jnp.array(camera.position), board)
@@ -191,24 +215,21 @@ def fitted(
         error = jnp.full(SHAPES, ROUGH_ERROR)
         return jax.tree.map(lambda a: a[best], Fits(refined.scene, error, refined.misfit))
 
-    seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
-    shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
-    # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more.
-    block = 1 if on_cpu() else SLOTS
-    fits = masked_vmap(fit, active, shared, element, (masks, boards, seeds), block=block)
-    # Parts of a segment that are fitted to a few points of it would explain those points well.
-    doubtful = active & whole & ~(fits.objects.valid & (fits.misfit < DOUBTFUL))
-    rough = masked_vmap(fit_roughly, doubtful, shared[1:], element, (masks, boards), block=block)
-    better = doubtful & rough.objects.valid & ((rough.misfit < BETTER * fits.misfit) | ~fits.objects.valid)
+    doubtful = fits.objects.valid & ~(fits.misfit < DOUBTFUL)
+    element = (image.points, image.depth, image.labels)
+    rough = masked_vmap(fit, doubtful, (camera, shelf), element, (masks, boards), block=1 if on_cpu() else SLOTS)
+    better = doubtful & rough.objects.valid & (rough.misfit < BETTER * fits.misfit)
+    return jax.tree.map(functools.partial(rows_where, better), rough, fits)
 
-    def chosen(rough, fit):
-        return jnp.where(better.reshape(-1, *[1] * (fit.ndim - 1)), rough, fit)
 
-    fits = jax.tree.map(chosen, rough, fits)
-    objects = fits.objects.replace(
-        valid=fits.objects.valid & active, size=jnp.where(active[:, None], fits.objects.size, 0.01)
-    )
-    return fits.replace(objects=objects)
+def rows_where(chosen: Bool[Array, " c"], a: Array, b: Array) -> Array:
+    """Rows of `a` where chosen, else of `b`."""
+    return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+
+def _alone(labels: Int[Array, "h w"], mask: Bool[Array, "h w"]) -> Int[Array, "h w"]:
+    """Labels in which a mask is segment 0, and other segments have other numbers."""
+    return jnp.where(mask, 0, jnp.where(labels >= 0, labels + 1, labels)).astype(jnp.int8)
 
 
 def standing(
