@@ -319,7 +319,7 @@ def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
     around = jnp.arange(-25.0, 26.0, 5.0)
     directions = pixel_rays(CAMERA, *jnp.meshgrid(row + around, column + around)).reshape(-1, 3)
     free = jnp.asarray(rng.uniform(0.5, 1.2, len(directions)), jnp.float32)
-    evidence = refinement._Evidence(directions, free, directions, free, free)
+    evidence = refinement._Evidence(directions, free, directions, free, free, 1.0)
     origin = jnp.array(CAMERA.position)
     points = jax.jit(refinement._closest_approach)(shape, origin, evidence)
     depth = np.linspace(0, 1, 4000)[:, None] * np.array(free)

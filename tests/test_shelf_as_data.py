@@ -24,7 +24,7 @@ from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.images.cloud import thinned_view
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception import explanation, recognition
+from mechsearch_jax.perception import explanation
 from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception.recogniser import Recogniser, labelled
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
@@ -196,7 +196,7 @@ def test_a_world_is_seen_by_one_program_from_both_cameras(two):
     world = jax.tree.map(jnp.asarray, from_scenario(SCENE))
     see, parts = (
         recogniser("masks", TARGET),
-        (recognisers.taken, labelled, recognition.recognise_image, simulated_camera.observe),
+        (recognisers.taken, labelled, explanation.explained_image, simulated_camera.observe),
     )
 
     def look(problem, given):

@@ -11,7 +11,10 @@ nothing outside of a batch.
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+import functools
+import types
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +25,24 @@ from mechsearch_jax.geometry.transforms import yaw_rotation
 from mechsearch_jax.images.detection import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.images.labels import MISSING, OTHER
 from mechsearch_jax.perception.confidence import Measures, confidence_of, measures_of
-from mechsearch_jax.perception.hypotheses import SLOTS, bordering, distinct, fitted, parts, pixels_of
-from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
+from mechsearch_jax.perception.hypotheses import (
+    SLOTS,
+    WAYS,
+    Fits,
+    bordering,
+    distinct,
+    fitted,
+    mended,
+    parts,
+    pixels_of,
+    rows_where,
+    standing,
+)
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import (
     Costs,
+    Moves,
     Sample,
     Selection,
     check_numbers,
@@ -76,6 +92,9 @@ class ExplanationConfig(Costs):
         for name, most in (("splits", SLOTS), ("merges", SLOTS**2)):
             if (number := getattr(self, name)) > most:
                 raise InputError(f"ExplanationConfig: {name} ({number}) must be at most {most}")
+
+
+AS_SEGMENTED = ExplanationConfig(splits=0, merges=0, drops=False)
 
 
 class Fitted(PyTreeNode):
@@ -136,20 +155,7 @@ def as_segmented(
     least: float = 0.0,
 ) -> Fitted:
     """The `Fitter` that keeps the segments as they are, such as true masks."""
-    # Compiled separately, since it does not depend on where the labels come from.
-    objects, pose, error = recognise_image(keys, image, shapes, camera, shelf, target, refinement)
-    measures = _measures_of_segments(keys[0], image, objects, error, camera, shelf)
-    return Fitted(objects, pose, confidence_of(measures), measures, image.labels, jnp.zeros(SLOTS, bool))
-
-
-@cached_jit()
-def _measures_of_segments(
-    key: Array, image: LabelledImage, objects: Superquadrics, error: Float[Array, " 8"], camera: Camera, shelf: Shelf
-) -> Measures:
-    costs = Costs()
-    sample = sample_of(key, image, objects, camera, shelf, costs)
-    unlimited = jnp.full(SLOTS, jnp.inf)
-    return measures_of(objects, image.labels, image, sample, error, unlimited, costs)
+    return explained_image(keys, image, shapes, camera, shelf, target, refinement, AS_SEGMENTED, least)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,6 +214,24 @@ class _FittedTarget(PyTreeNode):
     on_it: jax.Array
 
 
+class _Tried(PyTreeNode):
+    """What is fitted beside the segments' objects: both parts of every division, every union, and what is raised.
+
+    Attributes:
+      image: with pixels of segments without an object as OTHER.
+      sample: points and rays of it.
+      masks, active, boards: as of `fitted`.
+      moves: by which they enter an explanation.
+    """
+
+    image: LabelledImage
+    sample: Sample
+    masks: jax.Array
+    active: jax.Array
+    boards: jax.Array
+    moves: Moves
+
+
 def _explain(
     key: Array,
     image: LabelledImage,
@@ -217,22 +241,73 @@ def _explain(
     least: Float[Array, ""] | float,
 ) -> Fitted:
     """`explained_image` for a fitted target."""
-    keys, body = jax.random.split(key, 3), fitted_target.body
-    slots = jnp.arange(SLOTS, dtype=image.labels.dtype)
-    segments = image.labels[None] == slots[:, None, None]
-    base, base_error = fitted(keys[0], image, segments, jnp.any(segments, axis=(1, 2)), *settings)
+    keys, body, shelf = jax.random.split(key, 3), fitted_target.body, settings[2]
+    segments = image.labels[None] == jnp.arange(SLOTS, dtype=image.labels.dtype)[:, None, None]
     small = pixels_of(image.labels) <= jnp.sum(image.of_target)
-    base = base.replace(valid=base.valid & ~(_inside(base, body) & small))
+
+    def present(fits):
+        base = jax.tree.map(lambda a: a[:SLOTS], fits.objects)
+        return base.replace(valid=base.valid & ~(_inside(base, body) & small))
+
+    def tried(fits):
+        return _tried(keys[1], image, present(fits), fitted_target, settings[1:3], config, least)
+
+    def fit(key, given):
+        return fitted(key, image, given.masks, given.active, given.boards, *settings)
+
+    # First the segments, then what is tried beside them: in a loop, so that the fits are compiled once.
+    def step(turn, state):
+        fits, given = state
+        more = fit(keys[turn * 2], given)
+        # What stands on another object was taken to stand on the board, and is fitted again.
+        better = given.active & (more.objects.valid | ~fits.objects.valid)
+        both = jax.tree.map(functools.partial(rows_where, better), more, fits)
+        return both, jax.lax.cond(turn == 0, tried, lambda _: given, both)
+
+    masks = jnp.pad(segments, ((0, 2 * WAYS * config.splits + config.merges), (0, 0), (0, 0)))
+    segmented = {
+        "masks": masks,
+        "active": jnp.any(masks, axis=(1, 2)),
+        "boards": jnp.full(len(masks), shelf.board),
+    }
+    nothing = _zeros(lambda: fit(key, types.SimpleNamespace(**segmented)))
+    start = _zeros(lambda: tried(nothing)).replace(**segmented)
+    fits, given = jax.lax.fori_loop(0, 2, step, (nothing, start))
+    objects = fits.objects.replace(
+        valid=jnp.concatenate([present(fits).valid, fits.objects.valid[SLOTS:] & ~_inside(fits.objects, body)[SLOTS:]])
+    )
+    everything = jax.tree.map(lambda *a: jnp.concatenate(a), objects, body)
+    selection = select_objects(everything, given.moves, given.sample, pixels_of(given.image.labels), config)
+    return _chosen(fits.replace(objects=objects), given, selection, fitted_target, settings[1:3], config)
+
+
+def _zeros(of: Callable[[], Any]) -> Any:
+    """Zeros of the shapes that a function returns."""
+    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(of))
+
+
+def _tried(
+    key: Array,
+    image: LabelledImage,
+    base: Superquadrics,
+    fitted_target: _FittedTarget,
+    setting: tuple[Camera, Shelf],
+    config: ExplanationConfig,
+    least: Float[Array, ""] | float,
+) -> _Tried:
+    """What is worth trying beside the objects of the segments."""
+    camera, shelf = setting
     # Pixels of segments without an object belong to none.
     image = image.replace(labels=_without(image.labels, ~base.valid))
-    sample = sample_of(keys[1], image, base, *settings[1:3], config)
+    slots = jnp.arange(SLOTS, dtype=image.labels.dtype)
+    segments = image.labels[None] == slots[:, None, None]
+    sample = sample_of(key, image, base, camera, shelf, config)
     pixels = pixels_of(image.labels)
-    belongs = sample.label[None] == jnp.arange(SLOTS)[:, None]
+    belongs = sample.label[None] == slots[:, None]
     badly = jnp.sum(point_cost(surface_distance(base, sample.points), sample, config) * belongs, axis=1) * sample.weight
     bad = jnp.where(base.valid, badly + passed(base, sample, config), 0.0)
     doubtful = (bad > config.doubtful) & (bad > config.doubtful_share * pixels)
 
-    # Hypotheses: both parts of every division, and every union.
     chosen = jax.lax.top_k(bad, config.splits)[1]
     first = parts(image, base, chosen, sample.exact + config.wrong / 2, config.jump)
     whole = (image.labels[None] == chosen[:, None, None])[:, None]
@@ -240,29 +315,25 @@ def _explain(
     counts = jnp.sum(halves & sample.judged[None], axis=(1, 2))
     divided = (doubtful[chosen][:, None] & distinct(first, pixels[chosen])).reshape(-1)
     divided &= jnp.min(counts.reshape(-1, 2), axis=1) >= config.part
+    of_target = 2 * jnp.sum(halves & fitted_target.on_it[None], axis=(1, 2)) > jnp.sum(halves, axis=(1, 2))
+    of_target &= counts <= jnp.sum(image.of_target)
+    parted = jnp.repeat(divided, 2) & (counts > least) & ~of_target
+
     # What something hides in the middle shows two segments that do not border on each other, but whose objects overlap.
-    borders, deep = (
-        bordering(image.points, image.labels, config.jump),
-        jnp.triu(penetrations(base) - config.touching, 1),
-    )
+    borders = bordering(image.points, image.labels, config.jump)
+    deep = jnp.triu(penetrations(base) - config.touching, 1)
     either = (borders >= 3) & (doubtful[:, None] | doubtful[None])
     likely = jnp.where(either, borders, 0.0) + 1e4 * jnp.maximum(deep, 0.0)
     likely, pair = jax.lax.top_k(likely.reshape(-1), config.merges)
     low, high = pair // SLOTS, pair % SLOTS
     joined = (likely > 0.0) & base.valid[low] & base.valid[high]
     union = (image.labels[None] == low[:, None, None]) | (image.labels[None] == high[:, None, None])
-    of_target = 2 * jnp.sum(halves & fitted_target.on_it[None], axis=(1, 2)) > jnp.sum(halves, axis=(1, 2))
-    of_target &= counts <= jnp.sum(image.of_target)
-    active = jnp.concatenate([jnp.repeat(divided, 2) & (counts > least) & ~of_target, joined])
-    fits, error = fitted(keys[2], image, jnp.concatenate([halves, union]), active, *settings)
-    fits = fits.replace(valid=fits.valid & ~_inside(fits, body))
-    everything = jax.tree.map(lambda *a: jnp.concatenate(a), base, fits, body)
 
-    selection = select_objects(
-        everything, moves_of(chosen, divided, (low, high), joined, config.drops), sample, pixels, config
-    )
-    errors = jnp.concatenate([base_error, error, jnp.zeros(1)])
-    return _chosen(everything, errors, selection, image, fitted_target, sample, config)
+    masks = jnp.concatenate([segments, halves, union])
+    boards = standing(masks, base, sample, shelf.board)
+    raised = base.valid & (boards[:SLOTS] > shelf.board)
+    active = jnp.concatenate([raised, parted, joined])
+    return _Tried(image, sample, masks, active, boards, moves_of(chosen, divided, (low, high), joined, config.drops))
 
 
 def _without(labels: Int[Array, "h w"], absent: Bool[Array, " 8"]) -> Int[Array, "h w"]:
@@ -283,23 +354,23 @@ def _inside(scene: Superquadrics, body: Superquadrics) -> Bool[Array, " n"]:
 
 
 def _chosen(
-    everything: Superquadrics,
-    errors: Float[Array, " c"],
+    fits: Fits,
+    given: _Tried,
     selection: Selection,
-    image: LabelledImage,
     fitted_target: _FittedTarget,
-    sample: Sample,
+    setting: tuple[Camera, Shelf],
     config: ExplanationConfig,
 ) -> Fitted:
     """The selected objects in eight slots, those of segments that stay in theirs, with the labels of their pixels."""
+    image, sample = given.image, given.sample
     # There may be no hypotheses.
     stays, new = selection.selected[:SLOTS], jnp.pad(selection.selected[SLOTS:-1], (0, SLOTS))
     order = jnp.argsort(~new, stable=True)[:SLOTS]
     free = jnp.cumsum(~stays) - 1
     filled = ~stays & (free < jnp.sum(new))
     source = jnp.where(filled, SLOTS + order[jnp.clip(free, 0, SLOTS - 1)], jnp.arange(SLOTS))
-    scene: Superquadrics = jax.tree.map(lambda a: a[source], everything)
-    scene = scene.replace(valid=stays | filled)
+    fits, boards = jax.tree.map(lambda a: a[source], (fits, given.boards))
+    scene = fits.objects.replace(valid=stays | filled)
 
     # Pixels of segments that are no more go to the nearest of the objects that they lie on. What was no object's, such
     # as an undetected target, stays so.
@@ -310,5 +381,8 @@ def _chosen(
     nearest = jnp.where(jnp.min(near, axis=0) < sample.exact + config.wrong, jnp.argmin(near, axis=0), OTHER)
     nearest = jnp.where(fitted_target.on_it, OTHER, nearest.reshape(labels.shape))
     labels = jnp.where(gone, nearest, labels).astype(labels.dtype)
-    measures = measures_of(scene, labels, image, sample, errors[source], selection.margin[source], config)
+    masks = labels[None] == jnp.arange(SLOTS, dtype=labels.dtype)[:, None, None]
+    fits = mended(fits.replace(objects=scene), image, masks, boards, *setting)
+    scene = fits.objects
+    measures = measures_of(scene, labels, image, sample, fits.error, selection.margin[source], config)
     return Fitted(standard_edges(scene), fitted_target.pose, confidence_of(measures), measures, labels, filled)

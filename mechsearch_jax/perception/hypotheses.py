@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -11,8 +15,10 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import numbered
 from mechsearch_jax.images.labels import MISSING
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_with_error
-from mechsearch_jax.perception.refinement import RefinementConfig, refine
+from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
+from mechsearch_jax.perception.rough_shapes import SHAPES, rough_shapes
 from mechsearch_jax.perception.solids import surface_distance
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -22,6 +28,13 @@ SLOTS = 8
 WAYS = 3
 # Ways whose parts differ in less than this share of the segment's pixels are one.
 _ALIKE = 0.05
+# An object with a larger misfit is also fitted around its points, and that one is taken if its misfit is so many times
+# as large; how far its centre may be from the true one [m].
+DOUBTFUL, BETTER, ROUGH_ERROR = 0.06, 0.7, 0.01
+ROUGH = RefinementConfig.rough(hypotheses=(), stages=((6, 0.01), (10, 0.004)))
+# A thing stands on another if more than the first share of its points are over the other, and less than the second
+# beneath its top, which is higher than such a share of its points, by more than this [m].
+OVER, BENEATH, TOP, UNEVEN = 0.3, 0.05, 0.97, 0.012
 
 
 def connected(points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float) -> Int[Array, "h w"]:
@@ -110,38 +123,152 @@ def bordering(
     return total
 
 
+class Fits(PyTreeNode):
+    """Objects fitted to masks.
+
+    Attributes:
+      objects: one for each mask.
+      error: how far the network expects each centre to be from the true one, shape (C,) [m].
+      misfit: see `Refined`, shape (C,).
+    """
+
+    objects: Superquadrics
+    error: jax.Array
+    misfit: jax.Array
+
+
 def fitted(
     key: Array,
     image: LabelledImage,
     masks: Bool[Array, "c h w"],
     active: Bool[Array, " c"],
+    boards: Float[Array, " c"],
     shapes: ShapeNetwork,
     camera: Camera,
     shelf: Shelf,
     refinement: RefinementConfig,
-) -> tuple[Superquadrics, Float[Array, " c"]]:
-    """The object of every mask that is active: the network's, refined; and the network's expected error [m].
+) -> Fits:
+    """The object of every mask that is active: the network's, refined.
 
     The objects of other masks are not valid.
+
+    Args:
+      key: of the points drawn from the image.
+      image: of the camera.
+      masks, active: the pixels of each object, and which are fitted.
+      boards: height of what each stands on: it is recognised like an object on a board at that height [m].
+      shapes: the network.
+      camera, shelf: of the image.
+      refinement: static.
     """
     network = shapes.network
 
     def fit(shared, element, row):
         parameters, camera, shelf = shared
         points, depth, labels = element
-        mask, seed = row
-        alone = jnp.where(mask, 0, jnp.where(labels >= 0, labels + 1, labels)).astype(jnp.int8)
+        mask, board, seed = row
+        alone, shelf = _alone(labels, mask), dataclasses.replace(shelf, board=board)
         key = jax.random.key(seed)
         scene, error = recognise_with_error(key, network, parameters, camera, points, alone, shelf, 1)
-        refined = refine(camera, shelf, scene, points.reshape(-1, 3), alone.reshape(-1), depth, refinement).scene
-        return jax.tree.map(lambda a: a[0], (refined, error))
+        refined = refine(camera, shelf, scene, points.reshape(-1, 3), alone.reshape(-1), depth, refinement)
+        return jax.tree.map(lambda a: a[0], Fits(refined.scene, error, refined.misfit))
 
     seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
     shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
     # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more.
     block = 1 if on_cpu() else SLOTS
-    fits, error = masked_vmap(fit, active, shared, element, (masks, seeds), block=block)
-    return fits.replace(valid=fits.valid & active, size=jnp.where(active[:, None], fits.size, 0.01)), error
+    fits = masked_vmap(fit, active, shared, element, (masks, boards, seeds), block=block)
+    objects = fits.objects.replace(
+        valid=fits.objects.valid & active, size=jnp.where(active[:, None], fits.objects.size, 0.01)
+    )
+    return fits.replace(objects=objects)
+
+
+def mended(
+    fits: Fits,
+    image: LabelledImage,
+    masks: Bool[Array, "c h w"],
+    boards: Float[Array, " c"],
+    camera: Camera,
+    shelf: Shelf,
+) -> Fits:
+    """Objects of which those that explain little are fitted around their points alone, where that explains much more.
+
+    Args:
+      fits: the objects.
+      image: of the camera.
+      masks: their pixels.
+      boards: height of what each stands on [m].
+      camera, shelf: of the image.
+    """
+
+    def fit(shared, element, row):
+        camera, shelf = shared
+        points, depth, labels = element
+        mask, board = row
+        alone, shelf = _alone(labels, mask).reshape(-1), dataclasses.replace(shelf, board=board)
+        flat = points.reshape(-1, 3)
+        index, weight = select(alone, jnp.int8(0), ROUGH.points)
+        guesses = rough_shapes(flat[index], weight > 0.0, jnp.array(camera.position), board)
+        refined = refine(camera, shelf, guesses, flat, alone, depth, ROUGH, jnp.zeros(SHAPES, jnp.int8))
+        best = jnp.argmin(jnp.where(refined.scene.valid, refined.misfit, jnp.inf))
+        error = jnp.full(SHAPES, ROUGH_ERROR)
+        return jax.tree.map(lambda a: a[best], Fits(refined.scene, error, refined.misfit))
+
+    doubtful = fits.objects.valid & ~(fits.misfit < DOUBTFUL)
+    element = (image.points, image.depth, image.labels)
+    rough = masked_vmap(fit, doubtful, (camera, shelf), element, (masks, boards), block=1 if on_cpu() else SLOTS)
+    better = doubtful & rough.objects.valid & (rough.misfit < BETTER * fits.misfit)
+    return jax.tree.map(functools.partial(rows_where, better), rough, fits)
+
+
+def rows_where(chosen: Bool[Array, " c"], a: Array, b: Array) -> Array:
+    """Rows of `a` where chosen, else of `b`."""
+    return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+
+def _alone(labels: Int[Array, "h w"], mask: Bool[Array, "h w"]) -> Int[Array, "h w"]:
+    """Labels in which a mask is segment 0, and other segments have other numbers."""
+    return jnp.where(mask, 0, jnp.where(labels >= 0, labels + 1, labels)).astype(jnp.int8)
+
+
+def standing(
+    masks: Bool[Array, "c h w"], base: Superquadrics, sample: Any, board: Float[Array, ""] | float
+) -> Float[Array, " c"]:
+    """The height of what stands beneath each mask: the board, or the top of an object of another segment.
+
+    A thing stands on another if its points lie over the other's footprint, and none beneath the other's top. What
+    stands behind another has no points over it.
+
+    Args:
+      masks: pixels of things.
+      base: the objects of the segments.
+      sample: points of the image.
+      board: its height [m].
+    """
+    member = masks.reshape(masks.shape[0], -1)[:, sample.index] & (sample.label >= 0)[None]
+    points, of_base = sample.points, sample.label[None] == jnp.arange(SLOTS)[:, None]
+    tops = jax.vmap(lambda own: _percentile(points[:, 2], own, TOP))(of_base)
+
+    def over_it(solid):
+        level = points.at[:, 2].set(solid.position[2])
+        return surface_distance(jax.tree.map(lambda a: a[None], solid), level)[0] < 0.0
+
+    over = jax.vmap(over_it)(base)
+    below = points[None, :, 2] < tops[:, None] - UNEVEN
+    count = jnp.maximum(jnp.sum(member, axis=1), 1)[:, None]
+
+    def share(of):
+        return jnp.einsum("cp,np->cn", member.astype(jnp.float32), of.astype(jnp.float32)) / count
+
+    carries = (share(over) > OVER) & (share(below) < BENEATH) & (share(of_base) < BENEATH) & base.valid[None]
+    return jnp.max(jnp.where(carries, tops[None], board), axis=1)
+
+
+def _percentile(values: Float[Array, " p"], chosen: Bool[Array, " p"], share: float) -> Float[Array, ""]:
+    ordered = jnp.sort(jnp.where(chosen, values, jnp.inf))
+    last = jnp.floor(share * jnp.maximum(jnp.sum(chosen) - 1, 0)).astype(int)
+    return jnp.where(jnp.any(chosen), ordered[last], -jnp.inf)
 
 
 def pixels_of(labels: Int[Array, "h w"]) -> Int[Array, " 8"]:

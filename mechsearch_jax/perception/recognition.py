@@ -9,18 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.images.cloud import middle
-from mechsearch_jax.images.detection import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.images.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.perception.refinement import RefinementConfig, refine
-from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
 
 if TYPE_CHECKING:
     from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork
@@ -154,39 +150,3 @@ class LabelledImage(PyTreeNode):
     depth: jax.Array
     labels: jax.Array
     of_target: jax.Array
-
-
-@cached_jit(static_argnames=("target", "refinement"))
-def recognise_image(
-    keys: Key[Array, "2"],
-    image: LabelledImage,
-    shapes: ShapeNetwork,
-    camera: Camera,
-    shelf: Shelf,
-    target: Target,
-    refinement: RefinementConfig,
-) -> tuple[Superquadrics, Float[Array, " 3"], Float[Array, " 8"]]:
-    """The objects of a labelled image, and the target's pose: network, refinement, `superquadric.standard_edges`.
-
-    A segment that lies mostly in or on the target is ignored.
-
-    Args:
-      keys: for the points drawn from the objects, and from the target.
-      image: of the camera.
-      shapes: the network.
-      camera: the camera of the image, a `View`'s as in training.
-      shelf: with the objects.
-      target, refinement: static.
-
-    Returns:
-      Eight slots, of which slot i is instance i; x, y [m] and yaw [rad] of the target, meaningless but finite if it has
-      no pixels; and the network's `expected_error` of each object [m].
-    """
-    object_key, target_key = keys
-    pose, has_pixels = fitted_pose(target_key, target, shelf, camera, image.points, image.depth, image.of_target)
-    on_it = near_target(target, shelf, pose, image.points) & has_pixels
-    labels = without_phantoms(image.labels, on_it, image.of_target)
-    network, parameters = shapes.network, shapes.parameters
-    scene, error = recognise_with_error(object_key, network, parameters, camera, image.points, labels, shelf)
-    refined = refine(camera, shelf, scene, image.points.reshape(-1, 3), labels.reshape(-1), image.depth, refinement)
-    return standard_edges(refined.scene), pose, error

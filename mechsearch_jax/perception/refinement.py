@@ -41,6 +41,8 @@ FAR = 3.0
 # Largest step: relative change of the half-extents, centre [m], rotation [rad].
 LARGEST_STEP = (0.3,) * 3 + (0.03,) * 3 + (0.3,) * 3
 HALF_EXTENTS = (0.004, 0.3)
+# A point this near to the surface is explained, one twice as far is not, and rays may pass this deep [m].
+EXPLAINED = 0.005
 
 
 class Hypothesis(PyTreeNode):
@@ -133,6 +135,8 @@ class Refined(PyTreeNode):
       initial_cost: the same for the initial shapes with the chosen hypothesis' exponents, shape (N,).
       points: number of the object's points that were used, int32, shape (N,); with too few, the object is unchanged.
       hypothesis: index of the chosen hypothesis, int32, shape (N,).
+      misfit: how badly the image is explained, shape (N,): the share of the object's points that are not on its
+        surface, and the pixels whose rays pass through it over the number of its points.
     """
 
     scene: Superquadrics
@@ -140,6 +144,7 @@ class Refined(PyTreeNode):
     initial_cost: jax.Array
     points: jax.Array
     hypothesis: jax.Array
+    misfit: jax.Array
 
 
 class _Shape(PyTreeNode):
@@ -159,6 +164,7 @@ class _Evidence(PyTreeNode):
     directions: jax.Array
     free: jax.Array
     ray_weight: jax.Array
+    ray_pixels: jax.Array
 
 
 class _Fit(PyTreeNode):
@@ -190,8 +196,8 @@ def _plane_points(count: int) -> np.ndarray:
     return ((0.5 + np.arange(1, count + 1)[:, None] / ratio ** np.arange(1.0, 3.0)) % 1.0).astype(np.float32)
 
 
-def _window(camera: Camera, scene_object: Superquadrics, config: RefinementConfig) -> tuple[Array, Array]:
-    """Rows and columns of pixels in and around the image of an object's bounding box."""
+def _window(camera: Camera, scene_object: Superquadrics, config: RefinementConfig) -> tuple[Array, Array, Array]:
+    """Rows and columns of pixels in and around the image of an object's bounding box, and for how many each stands."""
     corners = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     T_world_object = make(scene_object.rotation, scene_object.position)
     pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
@@ -201,14 +207,14 @@ def _window(camera: Camera, scene_object: Superquadrics, config: RefinementConfi
     edge = jnp.array([camera.height - 1.0, camera.width - 1.0])
     low, high = jnp.clip(low, 0.0, edge), jnp.clip(high, 0.0, edge)
     pixels = jnp.round(low[None] + jnp.asarray(_plane_points(config.rays)) * (high - low)[None]).astype(jnp.int32)
-    return pixels[:, 0], pixels[:, 1]
+    return pixels[:, 0], pixels[:, 1], jnp.prod(high - low + 1.0) / config.rays
 
 
 def _evidence(camera, scene_object, label, points, labels, depth, config) -> _Evidence:
     index, weight = select(labels, label, config.points)
     object_points = points[index]
     finite = jnp.all(jnp.isfinite(object_points), axis=-1)
-    rows, columns = _window(camera, scene_object, config)
+    rows, columns, ray_pixels = _window(camera, scene_object, config)
     seen = depth[rows, columns]
     free = jnp.where(seen > FAR, FAR, seen) - config.tolerance
     informative = ~jnp.isnan(seen) & (free > 0.0)
@@ -218,6 +224,8 @@ def _evidence(camera, scene_object, label, points, labels, depth, config) -> _Ev
         directions=pixel_rays(camera, rows * 1.0, columns * 1.0),
         free=jnp.where(informative, free, 0.0),
         ray_weight=informative.astype(jnp.float32),
+        # A point stands for so many pixels of the object.
+        ray_pixels=ray_pixels / jnp.maximum(jnp.sum(labels == label) / jnp.maximum(jnp.sum(weight), 1.0), 1.0),
     )
 
 
@@ -362,6 +370,15 @@ def _evaluate(
     return cost + 0.5 * jnp.sum(prior_residual**2), dot(weighted.T, right), dot(weighted.T, rows)
 
 
+def _misfit(shape: _Shape, origin: Array, evidence: _Evidence) -> Array:
+    """`Refined.misfit` of a shape."""
+    off, _ = _distances(shape, evidence.points)
+    deep, _ = _distances(shape, _closest_approach(shape, origin, evidence))
+    badly = jnp.sum(evidence.point_weight * jnp.clip(jnp.abs(off) / EXPLAINED - 1.0, 0.0, 1.0))
+    passed = jnp.sum(evidence.ray_weight * (deep < -EXPLAINED)) * evidence.ray_pixels
+    return (badly + passed) / jnp.maximum(jnp.sum(evidence.point_weight), 1.0)
+
+
 def _fit(
     guess: _Shape, origin: Array, evidence: _Evidence, shelf: Shelf, config: RefinementConfig
 ) -> tuple[_Shape, Array, Array]:
@@ -416,6 +433,7 @@ def refine(
     labels: Int[Array, " p"],
     depth: Float[Array, "h w"],
     config: RefinementConfig | None = None,
+    owners: Int[Array, " n"] | None = None,
 ) -> Refined:
     """Fit recognised superquadrics to a depth image.
 
@@ -430,6 +448,7 @@ def refine(
       labels: the slot in `scene` of each point; other numbers for none.
       depth: along the camera's axis [m]; infinite where nothing is, NaN where nothing was measured.
       config: static; the default if None.
+      owners: the label of each object's points; its slot if None.
 
     Returns:
       the refined scene and diagnostics. Absent objects and those with too few points are unchanged. One whose centre
@@ -459,9 +478,10 @@ def refine(
         best = jnp.argmin(costs + config.switch * switched)
         shape, cost, initial = jax.tree.map(lambda a: a[best], (shapes, costs, before))
         count = jnp.sum(evidence.point_weight).astype(jnp.int32)
+        misfit = _misfit(shape, origin, evidence)
         refined = Superquadrics(jnp.exp(shape.log_size), shape.exponents, shape.position, shape.rotation, given.valid)
         kept = jax.tree.map(lambda a, b: jnp.where(usable & jnp.isfinite(cost), a, b), refined, given)
         kept = kept.replace(valid=kept.valid & above_board(shelf, kept.position, 0.0))
-        return Refined(kept, cost, initial, count, best.astype(jnp.int32))
+        return Refined(kept, cost, initial, count, best.astype(jnp.int32), misfit)
 
-    return jax.vmap(refine_object)(scene, jnp.arange(scene.capacity))
+    return jax.vmap(refine_object)(scene, jnp.arange(scene.capacity) if owners is None else owners)

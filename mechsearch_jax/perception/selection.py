@@ -83,6 +83,7 @@ class Sample(PyTreeNode):
     Attributes:
       points: of segments [m], shape (M, 3).
       label: of each point.
+      index: the pixel of each point.
       weight: pixels for each point.
       origin: of the rays, shape (3,).
       directions: of rays, shape (R, 3).
@@ -94,6 +95,7 @@ class Sample(PyTreeNode):
 
     points: jax.Array
     label: jax.Array
+    index: jax.Array
     weight: jax.Array
     origin: jax.Array
     directions: jax.Array
@@ -123,6 +125,7 @@ def sample_of(
     return Sample(
         points=points,
         label=label,
+        index=index,
         weight=total / costs.points,
         origin=jnp.array(camera.position),
         directions=pixel_rays(camera, *grid).reshape(-1, 3),

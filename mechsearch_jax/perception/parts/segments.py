@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.images.labels import OTHER
-from mechsearch_jax.perception.explanation import Explaining, ExplanationConfig, Fitted, Fitter
+from mechsearch_jax.perception.explanation import Fitted, Fitter, as_segmented
 from mechsearch_jax.perception.hypotheses import SLOTS, bordering, connected
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
@@ -24,8 +24,6 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# A segment stays, whether one superquadric explains it or not; what stands in the found target does not.
-_AS_GIVEN = Explaining(ExplanationConfig(splits=0, merges=0, drops=False))
 # The largest connected pieces of segments that are kept; further ones are crumbs.
 _PIECES = 32
 
@@ -58,7 +56,7 @@ class Connected:
       config: of the segments.
     """
 
-    of: Fitter = _AS_GIVEN
+    of: Fitter = as_segmented
     config: SegmentsConfig = dataclasses.field(default_factory=SegmentsConfig)
 
     def __call__(
