@@ -110,6 +110,17 @@ def targets_table(rows: Sequence[graspable.TargetRow]) -> Group:
     return Group(table, Text(explanation, style="dim"))
 
 
+def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
+    """What depth images are like: a row for each figure, a column for each sensor and view, or folder."""
+    table = plain_table("depth images")
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for name in dict.fromkeys(name for column in columns.values() for name in column):
+        table.add_row(name, *(f"{column[name]:.3g}" if name in column else "-" for column in columns.values()))
+    return table
+
+
 def detection_table(figures: Mapping[str, Any]) -> Table:
     """What is detected under every condition, as `detection.detection_figures` returns it, and in all."""
     table = plain_table("detection of the target")
