@@ -41,13 +41,15 @@ class Surfaces(PyTreeNode):
     """What an image shows, for a sensor that measures some surfaces worse than others.
 
     Attributes:
-      material: of each pixel's surface, uniformly distributed over bodies and shelf in 0 to 1; large is dark or shiny;
-        0 where nothing is; shape (h, w).
+      material: of each pixel's surface, uniformly distributed over things in 0 to 1; large is dark or shiny; 0 where
+        nothing is; shape (h, w).
+      shelf: which pixels show the shelf.
       mirrored: at which depth a pixel of the board would show the mirror image of what stands there [m]; infinite where
         it shows none, shape (h, w).
     """
 
     material: jax.Array
+    shelf: jax.Array
     mirrored: jax.Array
 
 
@@ -73,7 +75,7 @@ def surfaces_of(
     height = camera.position[2] + depth * rays(camera)[..., 2]
     on_board = (owner == SHELF) & (jnp.abs(height - shelf.board) < ON_BOARD)
     mirrored = jnp.where(on_board, mirrored_depth(camera, world, shelf), jnp.inf)
-    return Surfaces(jnp.where(owner == BACKGROUND, 0.0, material), mirrored)
+    return Surfaces(jnp.where(owner == BACKGROUND, 0.0, material), owner == SHELF, mirrored)
 
 
 class Sensor(PyTreeNode):
@@ -96,7 +98,8 @@ class Sensor(PyTreeNode):
       missing: share of pixels that are lost singly.
       grazing, softness: cosine of the angle of incidence at which half of the pixels are lost, and the width of the
         transition.
-      poor, lost: share of surfaces, bodies or shelf, that are dark or shiny, and of their pixels that are lost.
+      poor, poor_shelf: share of things, and of shelves, that are dark or shiny.
+      lost: share of the pixels of these that are lost.
       hole: length of the holes that lost pixels make, in pixels.
       mirror: a shiny board shows mirrored points down to so far below it [m].
       colour_shift: how far the colours lie too far to the right, in pixels.
@@ -119,6 +122,7 @@ class Sensor(PyTreeNode):
     grazing: jax.Array | np.ndarray | float = -1.0
     softness: jax.Array | np.ndarray | float = 0.03
     poor: jax.Array | np.ndarray | float = 0.0
+    poor_shelf: jax.Array | np.ndarray | float = 0.0
     lost: jax.Array | np.ndarray | float = 0.0
     hole: jax.Array | np.ndarray | float = 8.0
     mirror: jax.Array | np.ndarray | float = 0.0
@@ -140,10 +144,13 @@ class Sensor(PyTreeNode):
         keys = [jax.random.fold_in(key, place) for place in range(3, 12)]
         scale, shape = camera.fx / USUAL_FX, depth.shape
         true, depth = depth, jnp.where(hand(keys[0], camera, shape, number.arm), HAND_DEPTH, depth)
-        poor = jnp.zeros(shape, bool) if surfaces is None else (surfaces.material > 1.0 - number.poor) & (depth == true)
+        poor = jnp.zeros(shape, bool)
         if surfaces is not None:
+            share = jnp.where(surfaces.shelf, number.poor_shelf, number.poor)
+            poor = (surfaces.material > 1.0 - share) & (depth == true)
             below = (depth - surfaces.mirrored) * rays(camera)[..., 2]
-            depth = jnp.where(poor & (below < number.mirror), surfaces.mirrored, depth)
+            mirrors = poor & jnp.isfinite(surfaces.mirrored) & (below < number.mirror)
+            depth = jnp.where(mirrors, surfaces.mirrored, depth)
         cosine = incidence(camera, back_project(camera, depth))
         ragged = 2.0 * jax.scipy.stats.norm.cdf(field(keys[1], camera, shape, number.hole))
         depth = fattened(depth, number.fattening * scale * ragged, number.fattening * scale * 2.0)
@@ -183,19 +190,19 @@ SENSORS: Mapping[SensorName, Sensor] = MappingProxyType(
         "structured-light": Sensor(
             jitter=0.0011, noise=0.0014, length=6.0, wave=0.0022, wave_length=70.0, step=0.0029,
             baseline=0.055, widest=22.0, fattening=1.5, grazing=0.08, softness=0.02,
-            poor=0.08, lost=0.3, colour_shift=1.5, arm=0.05,
+            poor=0.08, poor_shelf=0.08, lost=0.3, colour_shift=1.5, arm=0.05,
         ),
-        # Like a RealSense before a shelf with a board of metal.
+        # Like a RealSense before a shelf of metal.
         "active-stereo": Sensor(
-            jitter=0.0012, noise=0.0054, length=10.0, wave=0.0038, wave_length=90.0,
-            baseline=0.03, widest=22.0, fattening=3.0, missing=0.003, grazing=0.46, softness=0.1,
-            poor=0.25, lost=0.5, mirror=0.035, colour_shift=2.0, arm=0.05,
+            jitter=0.0012, noise=0.0062, length=10.0, wave=0.0042, wave_length=90.0,
+            baseline=0.025, widest=22.0, fattening=2.5, missing=0.003, grazing=0.2, softness=0.1,
+            poor=0.15, poor_shelf=0.8, lost=0.6, hole=5.0, mirror=0.035, colour_shift=2.0, arm=0.05,
         ),
         # Like `images.noise.TimeOfFlight`, with the waves of light that takes several ways.
         "time-of-flight": Sensor(
             jitter=0.0012, noise=0.0006, length=4.0, wave=0.001, wave_length=70.0, slant=1.0,
             mixed=0.5, missing=0.005, grazing=0.1, softness=0.03,
-            poor=0.08, lost=0.3, colour_shift=1.0, arm=0.05,
+            poor=0.08, poor_shelf=0.08, lost=0.3, colour_shift=1.0, arm=0.05,
         ),
     }
 )  # fmt: skip

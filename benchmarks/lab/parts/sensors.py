@@ -51,7 +51,7 @@ def _looking(x: float, y: float, z: float, down: float, focal: float) -> Camera:
 
 VIEWS: Mapping[str, tuple[Camera, Shelf]] = {
     "table": (_looking(-0.05, 0.1, 1.017, 37.0, 525.0), FAR),
-    "shelf": (_looking(0.05, 0.1, 0.6, 10.0, 477.0), Shelf()),
+    "shelf": (_looking(0.1, 0.1, 0.645, 20.0, 477.0), Shelf()),
 }
 
 
