@@ -117,7 +117,7 @@ def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
     for name in columns:
         table.add_column(name, justify="right")
     for name in dict.fromkeys(name for column in columns.values() for name in column):
-        table.add_row(name, *(f"{column[name]:.3g}" if name in column else "-" for column in columns.values()))
+        table.add_row(name, *(f"{column[name]:.2f}" if name in column else "-" for column in columns.values()))
     return table
 
 

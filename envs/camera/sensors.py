@@ -142,7 +142,7 @@ class Sensor(PyTreeNode):
         """
         number = jax.tree.map(jnp.asarray, self)
         keys = [jax.random.fold_in(key, place) for place in range(3, 12)]
-        scale, shape = camera.fx / USUAL_FX, depth.shape
+        scale, shape = camera.fx / USUAL_FX, (depth.shape[0], depth.shape[1])
         true, depth = depth, jnp.where(hand(keys[0], camera, shape, number.arm), HAND_DEPTH, depth)
         poor = jnp.zeros(shape, bool)
         if surfaces is not None:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.camera.colour_image import scene_key
 from mechsearch_jax.envs.camera.sensors import SENSORS, Sensor, surfaces_of
 from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, SHELF, cast_shelf, observe
+from mechsearch_jax.images.camera_pose import with_pose
 from mechsearch_jax.images.noise import depth_of
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.train.scenes import random_world
@@ -44,9 +45,10 @@ FAR = Shelf(front=0.1, back=1.6, right=-1.5, left=1.5, ceiling=2.5)
 
 def _looking(x: float, y: float, z: float, down: float, focal: float) -> Camera:
     """A camera of 640 x 480 pixels that looks along x, and down by an angle [degrees]."""
-    R = Rotation.from_euler("y", down, degrees=True).as_matrix() @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    rows = tuple(tuple(map(float, row)) for row in R)
-    return Camera(640, 480, focal, focal, 320.0, 240.0, rows, (x, y, z))
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("y", down, degrees=True).as_matrix() @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T[:3, 3] = x, y, z
+    return with_pose(Camera(640, 480, focal, focal, 320.0, 240.0), T)
 
 
 VIEWS: Mapping[str, tuple[Camera, Shelf]] = {
@@ -83,16 +85,15 @@ def real_pictures(folder: Path) -> Iterator[Picture]:
         data = np.load(file)
         about = json.loads(str(data["camera"]))
         K, T = np.array(about["K"], float).reshape(3, 3), np.array(about["T_world_camera"], float)
-        centre = K[0, 2] + 0.5, K[1, 2] + 0.5
-        rows = tuple(tuple(map(float, row)) for row in T[:3, :3])
-        x, y, z = map(float, T[:3, 3])
-        camera = Camera(about["width"], about["height"], float(K[0, 0]), float(K[1, 1]), *centre, rows, (x, y, z))
+        lens = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
+        camera = with_pose(Camera(about["width"], about["height"], *map(float, lens)), T)
         depth = np.where(data["depth"] > 0, data["depth"] / 1e4, np.nan)
         body = data["mask"] != 255 if "mask" in data else np.zeros(depth.shape, bool)
         points = np.asarray(back_project(camera, cast_shelf(camera, shelf, rays(camera))))
         low, high = (shelf.front, shelf.right, shelf.board), (shelf.back, shelf.left, shelf.ceiling)
-        opening = np.all((points > np.array(low) - 1e-3) & (points < np.array(high) + 1e-3), axis=-1)
-        yield Picture(camera, shelf, depth, body, opening)
+        inside = np.all((points > np.array(low) - 1e-3) & (points < np.array(high) + 1e-3), axis=-1)
+        # How far a table reaches is not known.
+        yield Picture(camera, shelf, depth, body, inside & faces.exists())
 
 
 def simulated_pictures(sensor: Sensor, view: str, count: int, seed: int = 0) -> Iterator[Picture]:
@@ -132,7 +133,7 @@ def figures(picture: Picture) -> dict[str, float]:
     """
     camera, depth, d = picture.camera, picture.depth, np.asarray(rays(picture.camera), float)
     points = np.array(camera.position) + depth[..., None] * d
-    away = np.isfinite(depth) & ~ndimage.binary_dilation(picture.body, iterations=AROUND)
+    away = np.isfinite(depth) & (ndimage.distance_transform_edt(~picture.body) > AROUND)
     board = abs(camera.rotation[2][2]) > STEEP
     error, face = _off_plane(points, d, away, picture.shelf, board)
     found: dict[str, float] = {
@@ -142,19 +143,21 @@ def figures(picture: Picture) -> dict[str, float]:
     noise = np.where(near, error, np.nan)
     for lag in LAGS:
         pairs = ((noise[:, :-lag], noise[:, lag:]), (noise[:-lag], noise[lag:]))
-        found[f"correlation at {lag} px"] = float(np.mean([_correlation(a, b) for a, b in pairs]))
-    found[f"means of {BLOCK} px blocks [mm]"] = 1e3 * _deviation(_block_means(noise))
+        found[f"alike at {lag} px"] = float(np.mean([_correlation(a, b) for a, b in pairs]))
+    found[f"mean of {BLOCK} px [mm]"] = 1e3 * _deviation(_block_means(noise))
     # Beyond a face of its own noise, whichever it is.
     towards = error * d[..., 2] if board else -error
-    found["face above the margin"] = float(np.mean(towards[near] > MARGIN)) if near.sum() > LEAST else math.nan
+    found["of it above the margin [%]"] = (
+        100 * float(np.mean(towards[near] > MARGIN)) if near.sum() > LEAST else math.nan
+    )
     left, right = _gaps(depth, picture.body)
     for side, widths in (("left", left), ("right", right)):
         for part in (50, 90):
-            found[f"gap on the {side}, {part}% [px]"] = float(np.percentile(widths, part)) if widths else math.nan
-    found["holes"] = float(np.mean(~np.isfinite(depth[picture.inside])))
+            found[f"{side} gap, {part}% [px]"] = float(np.percentile(widths, part)) if widths else math.nan
+    found["holes [%]"] = 100 * float(np.mean(np.isnan(depth[picture.inside]))) if picture.inside.any() else math.nan
     below = picture.shelf.board - points[picture.body & np.isfinite(depth), 2]
     mirrors = len(below) > 0 and np.mean(below > BELOW) > FEW
-    found["mirrored below the board [mm]"] = 1e3 * float(np.percentile(below, 99)) if mirrors else math.nan
+    found["mirrored down to [mm]"] = 1e3 * float(np.percentile(below, 99)) if mirrors else math.nan
     return found
 
 
