@@ -85,8 +85,8 @@ def real_pictures(folder: Path) -> Iterator[Picture]:
         data = np.load(file)
         about = json.loads(str(data["camera"]))
         K, T = np.array(about["K"], float).reshape(3, 3), np.array(about["T_world_camera"], float)
-        lens = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
-        camera = with_pose(Camera(about["width"], about["height"], *map(float, lens)), T)
+        fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]) + 0.5, float(K[1, 2]) + 0.5
+        camera = with_pose(Camera(about["width"], about["height"], fx, fy, cx, cy), T)
         depth = np.where(data["depth"] > 0, data["depth"] / 1e4, np.nan)
         body = data["mask"] != 255 if "mask" in data else np.zeros(depth.shape, bool)
         points = np.asarray(back_project(camera, cast_shelf(camera, shelf, rays(camera))))
@@ -133,7 +133,7 @@ def figures(picture: Picture) -> dict[str, float]:
     """
     camera, depth, d = picture.camera, picture.depth, np.asarray(rays(picture.camera), float)
     points = np.array(camera.position) + depth[..., None] * d
-    away = np.isfinite(depth) & (ndimage.distance_transform_edt(~picture.body) > AROUND)
+    away = np.isfinite(depth) & np.logical_not(ndimage.binary_dilation(picture.body, iterations=AROUND))
     board = abs(camera.rotation[2][2]) > STEEP
     error, face = _off_plane(points, d, away, picture.shelf, board)
     found: dict[str, float] = {
