@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -117,7 +118,7 @@ def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
     for name in columns:
         table.add_column(name, justify="right")
     for name in dict.fromkeys(name for column in columns.values() for name in column):
-        table.add_row(name, *(f"{column[name]:.2f}" if name in column else "-" for column in columns.values()))
+        table.add_row(escape(name), *(f"{column[name]:.2f}" if name in column else "-" for column in columns.values()))
     return table
 
 
