@@ -46,7 +46,10 @@ class EpisodeOptions:
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
-    sensor: Literal["ideal", "structured-light", "active-stereo", "time-of-flight"] | None = None
+    sensor: Annotated[
+        Literal["ideal", "structured-light", "active-stereo", "time-of-flight"] | None,
+        tyro.conf.arg(metavar="{ideal,structured-light,active-stereo,time-of-flight}", help_behavior_hint=""),
+    ] = None
     world: tuple[str, ...] = ()
 
     def settings(self) -> Settings:
