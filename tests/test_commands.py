@@ -90,7 +90,7 @@ WRONG = {
     ),
     "mismatch where nothing is simulated": (
         ["inspect", "first-light", "--out", "maps", "--world", "friction=2"],
-        "inspect: simulates no world that could differ; leave --world out",
+        "inspect: simulates no world that could differ; leave --world and --sensor out",
     ),
     "help of the subcommand": (["bench", "plan", "--batch", "x"], "(mechsearch bench plan --help tells more)"),
     "no configuration file": (["search", "good.json", "--out", "out", "--config", "none.toml"], "none.toml: cannot be"),

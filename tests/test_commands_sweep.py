@@ -106,6 +106,18 @@ def test_worlds_that_differ_are_swept_and_share_a_compilation(jobs_of):
         jobs_of("evaluate", "one.json", "--world", "camera_shift=1")
 
 
+def test_a_sensor_is_a_key_of_the_world(jobs_of):
+    masks = ("one.json", "--recognition", "masks")
+    (short,) = jobs_of("evaluate", *masks, "--sensor", "active-stereo")
+    (long,) = jobs_of("evaluate", *masks, "--world", "sensor=active-stereo")
+    swept = jobs_of("sweep", *masks, "--world", "sensor=ideal,active-stereo,time-of-flight")
+    assert short.key == long.key == swept[1].key
+    assert swept[0].key == jobs_of("evaluate", *masks)[0].key
+    assert len({job.method.compile_key() for job in swept[1:]}) == 1
+    with pytest.raises(InputError, match="sensor is given twice"):
+        jobs_of("evaluate", *masks, "--sensor", "ideal", "--world", "sensor=ideal")
+
+
 def test_a_file_has_a_table_of_worlds_and_what_is_given_goes_before_it(folder, jobs_of):
     (folder / "sweep.toml").write_text(
         'scenarios = "one.json"\n[world]\nmass = [1, 2]\narm_stop = 2\nholes = "objects"\n'

@@ -14,7 +14,8 @@ from stage import HIDDEN, OPEN, Stage, grab
 from mechsearch_jax.actions import KINDS, ActionKind
 from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.recognisers import recogniser
-from mechsearch_jax.envs.camera.sensing import OtherNoise, Sensing, resized, sensing_of, true_camera
+from mechsearch_jax.envs.camera.sensing import Sensing, resized, sensing_of, true_camera
+from mechsearch_jax.envs.camera.sensors import Sensor
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
@@ -297,7 +298,7 @@ def test_exposure_and_noise_of_colour_are_as_given():
 
 def test_whether_a_pixel_is_lost_does_not_depend_on_its_noise():
     camera, depth = dataclasses.replace(CAMERA, width=300, height=300), jnp.full((300, 300), 0.7)
-    measured = OtherNoise(np.float32(0.001), np.float32(0.3))(jax.random.key(0), camera, depth)
+    measured = Sensor(scatter=np.float32(0.001), missing=np.float32(0.3))(jax.random.key(0), camera, depth)
     distance = np.linalg.norm(np.asarray(measured - back_project(camera, depth)), axis=-1)
     assert np.isnan(distance).mean() == pytest.approx(0.3, abs=0.01)
     assert np.sqrt(np.nanmean(distance**2)) == pytest.approx(0.001, rel=0.02)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mechsearch_jax.envs.camera.sensors import SENSORS
 from mechsearch_jax.envs.scenes.generator import outline, separation
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.images.cloud import above_board, cloud_of, draw, resample, shelf_view, view
@@ -242,6 +243,20 @@ def test_time_of_flight_mixes_depths_at_edges_only():
     assert np.std(edge) == pytest.approx(0.2 / np.sqrt(12), rel=0.25)
     assert np.allclose(seen[:-1, 1:79], 0.8, atol=1e-5)
     assert np.allclose(seen[:-1, 81:-1], 1.0, atol=1e-5)
+
+
+def test_scenes_are_taken_by_any_sensor_and_its_card_says_which():
+    config = scenes.SceneConfig(objects=(2, 3), noises=(no_noise, SENSORS["active-stereo"]))
+    coarse = shelf_view(stride=8)
+    world = scenes.random_world(jax.random.key(0), config)
+    many = jax.jit(jax.vmap(lambda key: scenes.capture(key, world, config, view=coarse)))
+    seen = many(jax.random.split(jax.random.key(1), 8))
+    by, lost = np.asarray(seen.sensor), np.isnan(np.asarray(seen.points)[..., 0]).mean(axis=(1, 2))
+    assert set(by) == {0, 1}
+    assert lost[by == 1].min() > lost[by == 0].max() + 0.01
+    assert scenes.origin(config)["noises"] == ["no_noise", "active-stereo"]
+    usual = scenes.origin(scenes.SceneConfig())["noises"]
+    assert usual == ["no_noise", repr(RandomDirection()), repr(TimeOfFlight())]
 
 
 def test_surface_points_are_spread_by_area():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -10,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.envs.camera.colour_image import scene_key
 from mechsearch_jax.envs.camera.recognisers import true_labels
-from mechsearch_jax.envs.camera.simulated_camera import cast_body, cast_shelf
+from mechsearch_jax.envs.camera.sensors import SENSORS, Sensor, surfaces_of
+from mechsearch_jax.envs.camera.simulated_camera import SHELF, cast_body, cast_shelf
 from mechsearch_jax.envs.scenes.generator import CATALOGUE
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
@@ -85,7 +88,10 @@ class SceneConfig:
 
 def origin(config: SceneConfig) -> dict[str, Any]:
     """The source of examples from these scenes, for the card of a network's weights."""
-    noises = [repr(n) if dataclasses.is_dataclass(n) else getattr(n, "__name__", str(n)) for n in config.noises]
+    noises = [
+        repr(noise) if name == type(noise).__name__ else name
+        for noise, name in zip(config.noises, noise_names(config), strict=True)
+    ]
     return {"source": "random scenes, ray-cast as they were needed", **dataclasses.asdict(config), "noises": noises}
 
 
@@ -350,9 +356,16 @@ def capture(
     camera = (view or shelf_view()).camera
     which, sensing = jax.random.split(key)
     depth, owner, alone = cast_world(camera, shelf, world)
-    sensors = [lambda k, d, noise=noise: noise(k, camera, d) for noise in config.noises]
+
+    def by(noise, key):
+        if not isinstance(noise, Sensor):
+            return noise(key, camera, depth)
+        shown = jnp.where((owner < 0) & jnp.isfinite(depth), SHELF, owner)
+        return noise(key, camera, depth, surfaces_of(scene_key(world), camera, shelf, world, shown, depth))
+
+    sensors = [functools.partial(by, noise) for noise in config.noises]
     sensor = jax.random.randint(which, (), 0, len(sensors))
-    points = jax.lax.switch(sensor, sensors, sensing, depth)
+    points = jax.lax.switch(sensor, sensors, sensing)
     return Capture(
         points=points,
         labels=true_labels(points, owner, shelf),
@@ -370,7 +383,8 @@ def in_catalogue(world: World) -> Bool[Array, " bodies"]:
 
 def noise_names(config: SceneConfig) -> list[str]:
     """Names of the sensors, as `Capture.sensor` numbers them."""
-    return [getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
+    sensors: dict[Any, str] = {sensor: name for name, sensor in SENSORS.items()}
+    return [sensors.get(noise) or getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
 
 
 def visible_share(seen: Capture) -> Float[Array, " objects"]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -108,6 +109,17 @@ def targets_table(rows: Sequence[graspable.TargetRow]) -> Group:
         " for meshes, whose poses are alike."
     )
     return Group(table, Text(explanation, style="dim"))
+
+
+def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
+    """What depth images are like: a row for each figure, a column for each sensor and view, or folder."""
+    table = plain_table("depth images")
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for name in dict.fromkeys(name for column in columns.values() for name in column):
+        table.add_row(escape(name), *(f"{column[name]:.2f}" if name in column else "-" for column in columns.values()))
+    return table
 
 
 def detection_table(figures: Mapping[str, Any]) -> Table:

@@ -104,22 +104,30 @@ class DrawnHoles(PyTreeNode):
         return jax.random.fold_in(jax.random.key(self.seed), number)
 
 
-def shadows(camera: Camera, depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
+def shadows(
+    camera: Camera,
+    depth: Float[Array, "h w"],
+    baseline: jax.Array | float = BASELINE,
+    narrowest: jax.Array | float = NARROWEST,
+    widest: jax.Array | float = WIDEST,
+) -> Bool[Array, "h w"]:
     """Which pixels have something nearer on their right that hides them from an eye farther to the right.
 
     Args:
       camera: of the image; may be traced.
       depth: the true one [m]; infinite where nothing is.
+      baseline: how far that eye is to the right [m].
+      narrowest, widest: least and largest width of a shadow, in pixels; no shadows if the latter is 0.
     """
     scale, width = camera.fx / USUAL_FX, depth.shape[1]
 
     def cast(k, lost):
         nearer = jnp.where(jnp.arange(width) + k < width, jnp.roll(depth, -k, axis=1), jnp.inf)
-        disparity = BASELINE * camera.fx * (1.0 / nearer - 1.0 / depth)
-        reach = jnp.ceil(jnp.clip(disparity, NARROWEST * scale, WIDEST * scale))
+        disparity = baseline * camera.fx * (1.0 / nearer - 1.0 / depth)
+        reach = jnp.ceil(jnp.clip(disparity, narrowest * scale, widest * scale))
         return lost | ((depth - nearer > JUMP) & (k <= reach))
 
-    farthest = jnp.ceil(jnp.asarray(WIDEST * scale)).astype(int)
+    farthest = jnp.ceil(jnp.asarray(widest * scale)).astype(int)
     return jax.lax.fori_loop(1, farthest + 1, cast, jnp.zeros(depth.shape, bool))
 
 
@@ -138,16 +146,35 @@ def blobs(
       share: of those pixels.
       length: of the waves, in pixels.
     """
-    turn, stretch, phase = jax.random.uniform(key, (3, WAVES, 1))
+    turn, stretch, phase = jax.random.uniform(key, (3, WAVES))
     count = 2 * math.pi * USUAL_FX / length * (0.75 + 0.5 * stretch)
-    height, width = inside.shape
-    x = (jnp.arange(width) + 0.5 - camera.cx) / camera.fx
-    y = (jnp.arange(height) + 0.5 - camera.cy) / camera.fy
-    along = count * jnp.cos(2 * math.pi * turn) * x[None] + 2 * math.pi * phase
-    down = count * jnp.sin(2 * math.pi * turn) * y[None]
-    # cos(a + b) = cos a cos b - sin a sin b
-    field = jnp.einsum("kh,kw->hw", jnp.cos(down), jnp.cos(along), precision="highest")
-    field -= jnp.einsum("kh,kw->hw", jnp.sin(down), jnp.sin(along), precision="highest")
+    turn = 2 * math.pi * turn
+    field = plane_waves(camera, inside.shape, count * jnp.cos(turn), count * jnp.sin(turn), 2 * math.pi * phase)
     highest = jnp.sort(jnp.where(inside, field, -jnp.inf).reshape(-1), descending=True)
     number = jnp.round(share * jnp.sum(inside)).astype(int)
     return inside & (field > highest[jnp.minimum(number, highest.size - 1)])
+
+
+def plane_waves(
+    camera: Camera,
+    shape: tuple[int, ...],
+    right: Float[Array, " waves"],
+    down: Float[Array, " waves"],
+    phase: Float[Array, " waves"],
+) -> Float[Array, "h w"]:
+    """A sum of cosines over the rays of an image.
+
+    Args:
+      camera: of the image; may be traced.
+      shape: of the image, h and w.
+      right, down: change of each one's angle with the tangents of a ray's angles to the camera's axis [rad].
+      phase: angle of each along the axis [rad].
+    """
+    height, width = shape
+    x = (jnp.arange(width) + 0.5 - camera.cx) / camera.fx
+    y = (jnp.arange(height) + 0.5 - camera.cy) / camera.fy
+    across = right[:, None] * x[None] + phase[:, None]
+    along = down[:, None] * y[None]
+    # cos(a + b) = cos a cos b - sin a sin b
+    field = jnp.einsum("kh,kw->hw", jnp.cos(along), jnp.cos(across), precision="highest")
+    return field - jnp.einsum("kh,kw->hw", jnp.sin(along), jnp.sin(across), precision="highest")

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing, drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.sensing import Sensing, sensed_depth, true_camera
+from mechsearch_jax.envs.camera.sensors import surfaces_of
 from mechsearch_jax.envs.camera.simulated_camera import SHELF, observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
@@ -127,14 +128,21 @@ def taken(
     if target_colour is not None:
         appearance = drawn_appearance(scene_key(world), target_colour, camera.hue_gap)
     image = observe(true_camera(view.camera, sensing), world, shelf, appearance)
-    points = (sensing.noise or noise)(depth_key, view.camera, sensed_depth(view.camera, world, image, sensing))
+    depth, colour = sensed_depth(view.camera, world, image, sensing), image.colour
+    if sensing.noise is None:
+        points = noise(depth_key, view.camera, depth)
+    else:
+        there = true_camera(view.camera, sensing)
+        surfaces = surfaces_of(scene_key(world), there, shelf, world, image.segmentation, image.depth)
+        points = sensing.noise(depth_key, view.camera, depth, surfaces)
+        colour = sensing.noise.shifted(view.camera, colour)
     depth = measured_depth(view.camera, image.depth, points)
     if target_colour is None:
         mask = jnp.where(image.segmentation == SHELF, FREE, image.segmentation)
         return ViewImages(depth, mask=mask, target_id=jnp.int32(TARGET))
     # A camera does not tell nothing from what it does not measure.
     depth = jnp.where(jnp.isfinite(depth), depth, jnp.nan)
-    return ViewImages(depth, sensed_colour(colour_key, image.colour, camera))
+    return ViewImages(depth, sensed_colour(colour_key, colour, camera))
 
 
 def recogniser(name: str, target: Target, detector: TargetColour | None = None) -> Recogniser:

@@ -11,19 +11,19 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float
 
 from mechsearch_jax.envs.camera.colour_image import ColourSensing
 from mechsearch_jax.envs.camera.holes import HOLES, DrawnHoles
+from mechsearch_jax.envs.camera.sensors import SENSORS, Sensor
 from mechsearch_jax.envs.camera.simulated_camera import Image
 from mechsearch_jax.envs.world.mismatch import Mismatch, TrueCell
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.geometry.footprints import extents
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, matmul, transform
-from mechsearch_jax.images.noise import scattered
 from mechsearch_jax.runtime.pytree import PyTreeNode
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera
 
 Bodies = TypeVar("Bodies", World, Superquadrics)
 
@@ -40,24 +40,6 @@ class Place(PyTreeNode):
     T_seen_world: jax.Array | np.ndarray
 
 
-class OtherNoise(PyTreeNode):
-    """The `NoiseModel` like `noise.RandomDirection`, but with pixels without a measurement, and all numbers data.
-
-    Attributes:
-      deviation: standard deviation of the points' distance [m].
-      missing: share of pixels without a measurement.
-    """
-
-    deviation: jax.Array | np.ndarray
-    missing: jax.Array | np.ndarray
-
-    def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-        points = scattered(key, back_project(camera, depth), jnp.asarray(self.deviation))
-        # 0 and 1 would give the keys that `scattered` splits off: what is lost would depend on the noise.
-        lost = jax.random.uniform(jax.random.fold_in(key, 2), depth.shape) < self.missing
-        return jnp.where(lost[..., None], jnp.nan, points)
-
-
 class Sensing(PyTreeNode):
     """How what is seen in an episode differs from what the planner assumes.
 
@@ -70,7 +52,7 @@ class Sensing(PyTreeNode):
     """
 
     place: Place | None = None
-    noise: OtherNoise | None = None
+    noise: Sensor | None = None
     colour: ColourSensing | None = None
     sizes: jax.Array | np.ndarray | None = None
     holes: DrawnHoles | None = None
@@ -84,7 +66,10 @@ def sensing_of(mismatch: Mismatch, cell: TrueCell) -> Sensing | None:
         T_seen_world = np.linalg.inv(cell.T_base_moved) @ T_base_world
         place = Place(*(np.asarray(T, np.float32) for T in (T_base_world, T_seen_world)))
     if mismatch.measures_otherwise:
-        noise = OtherNoise(*(np.asarray(n, np.float32) for n in (mismatch.depth_noise, mismatch.missing_depth)))
+        noise = SENSORS[mismatch.sensor]
+        scatter = mismatch.depth_noise if mismatch.sensor == "ideal" else noise.scatter
+        missing = mismatch.missing_depth + noise.missing * (1.0 - mismatch.missing_depth)
+        noise = jax.tree.map(np.float32, noise.replace(scatter=scatter, missing=missing))
     if mismatch.colours_otherwise:
         numbers = (mismatch.colour_noise, mismatch.exposure, mismatch.white_balance, mismatch.hue_gap)
         colour = ColourSensing(*(np.asarray(n, np.float32) for n in numbers))

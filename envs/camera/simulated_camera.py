@@ -5,6 +5,7 @@ Every ray is cut with every body in closed form: neither a display nor OpenGL is
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -139,6 +140,16 @@ def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3
         towards = [directions[..., i] for i in range(3)]
         depth = jnp.minimum(depth, _BOARD.cut(origin, towards, jnp.array(half, jnp.float32), jnp))
     return depth
+
+
+def mirrored_depth(camera: Camera, world: World, shelf: Shelf) -> Float[Array, "h w"]:
+    """Depth of the bodies' mirror images in a board without end [m]; infinite where a ray meets none.
+
+    A ray that the board reflects is one that starts as far below the board as the camera stands above.
+    """
+    x, y, z = camera.position
+    below = dataclasses.replace(camera, position=(x, y, 2.0 * shelf.board - z))
+    return _cast_bodies(below, world, rays(camera) * jnp.array([[[1.0, 1.0, -1.0]]]))[0]
 
 
 def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, depth: Array, owner: Array) -> Array:

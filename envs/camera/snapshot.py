@@ -220,7 +220,7 @@ def _seen_objects(snapshot: Snapshot) -> tuple[Superquadrics, Bool[Array, ""], F
       InputError: depth or colour are measured otherwise, which without an image would change nothing.
     """
     if snapshot.sensing is not None and snapshot.sensing.noise is not None:
-        raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
+        raise InputError("sensor, depth_noise and missing_depth need an image; take the recogniser masks or full")
     if snapshot.sensing is not None and snapshot.sensing.colour is not None:
         raise InputError("colour_noise, exposure, white_balance and hue_gap need an image; take the recogniser full")
     objects = as_seen(resized(objects_on_the_board(snapshot), snapshot.sensing), snapshot.sensing)

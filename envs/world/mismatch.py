@@ -25,6 +25,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "soft-friction", "pyramidal-cone"]
 HolesName = Literal["none", "objects", "shadows", "scattered", "target", "patches"]
+SensorName = Literal["ideal", "structured-light", "active-stereo", "time-of-flight"]
 
 # Largest shift of camera and shelf [m], and largest turn [degrees].
 FARTHEST, STEEPEST = 0.2, 20.0
@@ -66,6 +67,7 @@ class Mismatch:
       hue_gap: least difference of the objects' hues from the target's [degrees]; 0 for any colour.
       holes: connected parts of the image without depth, by the name of one of `holes.HOLES`; `oracle` and `informed` do
         not know what lies in them either.
+      sensor: the depth camera, by the name of one of `sensors.SENSORS`; only `ideal` has `depth_noise`.
     """
 
     friction: float = option(1.0, "factor on the simulated world's sliding frictions")
@@ -99,6 +101,7 @@ class Mismatch:
     holes: HolesName = option(
         "none", "what the simulated depth camera does not measure, in connected holes", get_args(HolesName)
     )
+    sensor: SensorName = option("ideal", "what kind of depth camera is simulated", get_args(SensorName))
 
     def __post_init__(self):
         for name, low, high, unit in (
@@ -122,9 +125,11 @@ class Mismatch:
             check_range(f"Mismatch: {name}", getattr(self, name), low, high, unit)
             # Convert to one type, for rows keep what was given.
             object.__setattr__(self, name, float(getattr(self, name)))
-        for name, names in (("physics", get_args(PhysicsName)), ("holes", get_args(HolesName))):
-            if getattr(self, name) not in names:
-                raise InputError(f'Mismatch: {name} "{getattr(self, name)}" is unknown; use {", ".join(names)}')
+        for name, kind in (("physics", PhysicsName), ("holes", HolesName), ("sensor", SensorName)):
+            if (given := getattr(self, name)) not in get_args(kind):
+                raise InputError(f'Mismatch: {name} "{given}" is unknown; use {", ".join(get_args(kind))}')
+        if self.sensor != "ideal" and self.depth_noise != USUAL_NOISE:
+            raise InputError(f"Mismatch: depth_noise is of sensor ideal; {self.sensor} has its own, leave it out")
 
     @property
     def moves_robot(self) -> bool:
@@ -144,7 +149,7 @@ class Mismatch:
     @property
     def measures_otherwise(self) -> bool:
         """Whether measured depth differs from the usual."""
-        return self.depth_noise != USUAL_NOISE or self.missing_depth > 0.0
+        return (self.sensor, self.depth_noise) != ("ideal", USUAL_NOISE) or self.missing_depth > 0.0
 
     @property
     def colours_otherwise(self) -> bool:
@@ -171,7 +176,7 @@ class Mismatch:
           InputError: they cannot.
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
-            raise InputError("depth_noise and missing_depth need an image; add --recognition masks or full")
+            raise InputError("sensor, depth_noise and missing_depth need an image; add --recognition masks or full")
         if recognition not in ("oracle", "informed") and self.resizes:
             raise InputError(
                 "size_spread: shapes from images are off by themselves; take --recognition oracle or informed"

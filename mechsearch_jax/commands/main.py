@@ -89,6 +89,7 @@ IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
         "recognition",
         "scenes",
         "segmentation",
+        "sensors",
         "targets",
     ),
 }

@@ -39,12 +39,17 @@ class EpisodeOptions:
         target's too; the others see noisy depth, "masks" with true segments; "-parts": bodies of up to four parts.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
+      sensor: the simulated depth camera; short for --world sensor=NAME.
       world: how the simulated world differs from what the planner assumes.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "masks-parts", "full", "full-parts", "informed"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
+    sensor: Annotated[
+        Literal["ideal", "structured-light", "active-stereo", "time-of-flight"] | None,
+        tyro.conf.arg(metavar="{ideal,structured-light,active-stereo,time-of-flight}", help_behavior_hint=""),
+    ] = None
     world: tuple[str, ...] = ()
 
     def settings(self) -> Settings:
@@ -65,7 +70,7 @@ class EpisodeOptions:
         Raises:
           InputError: an option is impossible.
         """
-        return mismatch_of(self.world)
+        return mismatch_of((*self.world, *([] if self.sensor is None else [f"sensor={self.sensor}"])))
 
     def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
         """The method of each policy.
@@ -126,8 +131,8 @@ class EpisodeOptions:
         Raises:
           InputError: an option of it is given.
         """
-        if self.world:
-            raise InputError(f"{command}: simulates no world that could differ; leave --world out")
+        if self.world or self.sensor is not None:
+            raise InputError(f"{command}: simulates no world that could differ; leave --world and --sensor out")
 
 
 # Default of a command's parameter `options`, before `with_planner_options` adds the planner's.
@@ -165,8 +170,8 @@ _SEARCH = ("config_file", "simulator", "preset", "retrieval_contact", "trials", 
 
 def _box(name: str) -> str:
     """The box of an option."""
-    if name in ("recognition", "world"):
-        return name
+    if name in ("recognition", "world", "sensor"):
+        return "world" if name == "sensor" else name
     return "search" if name in _SEARCH else "planner"
 
 

@@ -114,7 +114,7 @@ class TimeOfFlight:
     def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
         mix, blend, noise, lost = jax.random.split(key, 4)
         points = back_project(camera, depth)
-        cosine = _incidence(camera, points)
+        cosine = incidence(camera, points)
         right, below = jnp.roll(depth, -1, axis=1), jnp.roll(depth, -1, axis=0)
         other = jnp.where(jnp.abs(right - depth) > self.edge, right, below)
         at_edge = (jnp.abs(other - depth) > self.edge) & jnp.isfinite(other) & jnp.isfinite(depth)
@@ -128,7 +128,7 @@ class TimeOfFlight:
         return back_project(camera, jnp.where(kept, measured, jnp.nan))
 
 
-def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
+def incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
     """Cosine of the angle between each pixel's ray and the normal of the surface through its neighbours.
 
     The neighbours to the right and below give one normal, those to the left and above another; the larger cosine

@@ -21,7 +21,7 @@ from mechsearch_jax.calibration.check import apparent, is_beyond
 from mechsearch_jax.calibration.fit import ALL_PIXELS, FEW_PIXELS, ShelfFit, fit_shelf
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.calibration.report import correction
-from mechsearch_jax.envs.camera.sensing import OtherNoise
+from mechsearch_jax.envs.camera.sensors import Sensor
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.images.camera_pose import with_pose
@@ -140,7 +140,7 @@ class CalibrationBench:
 
     def noises(self) -> dict[str, NoiseModel]:
         """The sensors by their names."""
-        usual = OtherNoise(jnp.float32(self.deviation), jnp.float32(self.missing))
+        usual = Sensor(scatter=jnp.float32(self.deviation), missing=jnp.float32(self.missing))
         return {
             f"{1000 * self.deviation:g} mm, {100 * self.missing:g}% missing": usual,
             "time-of-flight": TimeOfFlight(),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from mechsearch_jax.commands.options import (
     JsonFile,
     Scenarios,
+    at_least_one,
     check_files,
     find_scenarios,
     forget_kept_compilations,
@@ -111,4 +113,32 @@ def bench_bodies(
     console.print(bodies_tables(measured))
 
 
-COMMANDS = {"looks": bench_looks, "bodies": bench_bodies}
+def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = None) -> None:
+    """Measure what the depth images of simulated sensors are like, and beside them real ones.
+
+    Args:
+      scenes: images of each sensor and view.
+      real: folder of folders of labelled images; each is a column.
+      out: JSON file for the figures.
+
+    Raises:
+      InputError: there are no images in the folder, or the file cannot be written.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.lab.parts import sensors
+    from mechsearch_jax.benchmarks.lab.tables import sensors_table
+    from mechsearch_jax.runtime.files import save_json
+
+    check_files(out)
+    at_least_one("lab sensors", scenes=scenes)
+    console = Console(highlight=False)
+    with console.status("measuring"):
+        columns = {} if real is None else sensors.real_columns(real)
+        columns |= sensors.simulated_columns(scenes)
+        if out is not None:
+            save_json(columns, out)
+    console.print(sensors_table(columns))
+
+
+COMMANDS = {"looks": bench_looks, "bodies": bench_bodies, "sensors": bench_sensors}
