@@ -78,7 +78,7 @@ def cache_size(function):
 def test_a_shelf_survives_jax_and_is_what_it_was_outside():
     shelf = Shelf(front=0, back=1, spawn_x=[0.45, 0.7])
     leaves, structure = jax.tree.flatten(shelf)
-    assert [type(leaf) for leaf in leaves] == [float] * 13
+    assert [type(leaf) for leaf in leaves] == [float] * 17
     again = jax.tree.unflatten(structure, leaves)
     assert (again, hash(again), repr(again)) == (shelf, hash(shelf), repr(shelf))
     assert shelf == Shelf(front=0.0, back=np.float64(1.0), spawn_x=(0.45, 0.7)) != MOVED
@@ -86,7 +86,7 @@ def test_a_shelf_survives_jax_and_is_what_it_was_outside():
     assert jax.tree.structure(shelf) == jax.tree.structure(MOVED)
     # Whatever JAX puts in the place of leaves is not looked at.
     for other in (None, True, object(), jax.ShapeDtypeStruct((), jnp.float32), jnp.float32(-1.0)):
-        rebuilt = jax.tree.unflatten(structure, [other] * 13)
+        rebuilt = jax.tree.unflatten(structure, [other] * 17)
         assert rebuilt.front is other
         assert rebuilt.spawn_x == (other,) * 2
     # What was traced is on the host what it was before.

@@ -134,11 +134,12 @@ def _cast_bodies(
 def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
     """Depth of the empty shelf along rays from the camera [m]; infinite where a ray misses it."""
     depth = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
-    for low, high in shelf_corners(shelf).values():
+    for name, (low, high) in shelf_corners(shelf).items():
         centre, half = ([sign(a, b) / 2 for a, b in zip(high, low, strict=True)] for sign in (add, sub))
         origin = [jnp.float32(camera.position[i] - centre[i]) for i in range(3)]
         towards = [directions[..., i] for i in range(3)]
-        depth = jnp.minimum(depth, _BOARD.cut(origin, towards, jnp.array(half, jnp.float32), jnp))
+        shown = _BOARD.cut(origin, towards, jnp.array(half, jnp.float32), jnp)
+        depth = jnp.minimum(depth, shown if name == "board" else jnp.where(shelf.is_open(name), jnp.inf, shown))
     return depth
 
 
@@ -172,12 +173,13 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
 def _wall_normals(shelf: Shelf, point: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Outward normals of the shelf at points on it."""
     x, y, z = (point[..., k] for k in range(3))
+    walls = shelf.walls
     gaps = jnp.stack(
-        [jnp.abs(x - shelf.back), jnp.abs(y - shelf.right), jnp.abs(y - shelf.left), jnp.abs(z - shelf.board)], axis=-1
+        [jnp.abs(x - walls.back), jnp.abs(y - walls.right), jnp.abs(y - walls.left), jnp.abs(z - shelf.board)], axis=-1
     )
-    walls = jnp.array([(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)])
+    normals = jnp.array([(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)])
     wall = jnp.where(jnp.min(gaps, axis=-1) < 1e-4, jnp.argmin(gaps, axis=-1), 4)
-    return walls[wall]
+    return normals[wall]
 
 
 def _first_solids(camera: Camera, shelf: Shelf, world: World, directions: Array) -> tuple[Array, Array, Array]:

@@ -299,7 +299,7 @@ def target(settings: Settings) -> Iterator[Finding]:
     if min(widths) > opening:
         says = f"target: {min(widths):.3f} m wide, but the gripper takes {opening} m"
         yield Finding("target", State.BROKEN, says, "mend [target] half_size, or [gripper] usable_opening")
-    elif 2 * body.half_size[2] >= shelf.ceiling - shelf.ceiling_margin - shelf.board:
+    elif 2 * body.half_size[2] >= shelf.walls.ceiling - shelf.ceiling_margin - shelf.board:
         says = f"target: {2 * body.half_size[2]:.3f} m high, more than the shelf's free space"
         yield Finding("target", State.BROKEN, says, "mend [target] half_size, or [shelf] board and ceiling")
     else:

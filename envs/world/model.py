@@ -223,6 +223,8 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
         ("right", 1, shelf.right, (0.0, 1.0, 0.0)),
         ("left", 1, shelf.left, (0.0, -1.0, 0.0)),
     ):
+        if name not in ("board", *shelf.faces):
+            continue
         position = [0.0, 0.0, 0.0]
         position[axis] = value - MARGIN * sum(normal)
         element(
@@ -304,7 +306,8 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
 
 
 def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
-    """Lower and upper corners of the shelf's boards, axis-aligned boxes in the world [m]; the shelf may be traced."""
+    """Lower and upper corners of the shelf's boards, axis-aligned boxes in the world [m], also of faces that it does
+    not have; the shelf may be traced."""
     t = shelf.thickness
     low, high = (shelf.front, shelf.right - t), (shelf.back + t, shelf.left + t)
     return {
@@ -317,8 +320,9 @@ def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[A
 
 
 def shelf_boxes(shelf: Shelf) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """`shelf_corners` as NumPy arrays."""
-    return {name: (np.array(low), np.array(high)) for name, (low, high) in shelf_corners(shelf).items()}
+    """`shelf_corners` of the board and the faces that there are, as NumPy arrays."""
+    there = ("board", *shelf.faces)
+    return {name: (np.array(a), np.array(b)) for name, (a, b) in shelf_corners(shelf).items() if name in there}
 
 
 def panda_shelf_mjcf(

@@ -13,7 +13,7 @@ from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.sight import camera_faults
+from mechsearch_jax.workspace.sight import camera_faults, enters
 
 # A limit is passed by so many standard errors.
 CERTAIN = 3.0
@@ -145,7 +145,7 @@ def holding(fit: ShelfFit, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> str
 
 
 class _Opening(NamedTuple):
-    """N rays through the shelf's opening: where they start, their ways at unit depth, and the points that they show."""
+    """N rays through the shelf's openings: where they start, their ways at unit depth, and the points they show."""
 
     place: np.ndarray
     ways: np.ndarray
@@ -153,7 +153,7 @@ class _Opening(NamedTuple):
 
 
 def _opening(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> _Opening:
-    """The measured rays through the shelf's opening."""
+    """The measured rays through the shelf's front, and sides without a face, that end in it or behind a face."""
     rows, columns = np.arange(0, camera.height, THINNED), np.arange(0, camera.width, THINNED)
     v, u = np.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
     ways = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.array(camera.rotation).T
@@ -161,10 +161,12 @@ def _opening(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> _
     known = np.isfinite(seen) & measured(seen)
     ways, points = ways[known], place + seen[known, None] * ways[known]
     low, high = _corners(shelf)
-    to_front = (shelf.front - place[0]) / np.where(ways[:, 0] > 1e-6, ways[:, 0], np.inf)
-    entry = place + to_front[:, None] * ways
-    enters = np.all((entry[:, 1:] > low[1:]) & (entry[:, 1:] < high[1:]), axis=1) & (to_front > 0)
-    return _Opening(place, ways[enters], points[enters])
+    # What is behind a side without a face is not the shelf's.
+    x, y, z = points.T
+    gaps = {"back": high[0] - x, "right": y - low[1], "left": high[1] - y, "ceiling": high[2] - z}
+    within = np.all([gap > 0 for face, gap in gaps.items() if face not in shelf.faces] or [True], axis=0)
+    kept = enters(shelf, place, ways) & within
+    return _Opening(place, ways[kept], points[kept])
 
 
 def _shares(shelf: Shelf, points: np.ndarray) -> tuple[float, float]:

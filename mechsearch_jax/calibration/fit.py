@@ -194,6 +194,11 @@ FACES = (
 )
 
 
+def faces_of(shelf: Shelf) -> tuple[Face, ...]:
+    """Those of `FACES` that a shelf has."""
+    return tuple(face for face in FACES if face.field in ("board", *shelf.faces))
+
+
 # Pixels that are used: of a whole calibration, and of the check at every look.
 ALL_PIXELS, FEW_PIXELS = 1_000_000, 60_000
 # How far from its place a face is searched [m].
@@ -250,7 +255,7 @@ class ShelfFit:
       covariance: of shift and turn, in the directions that are determined, shape (6, 6).
       undetermined: directions of (shift, `LEVER` * turn) that the image does not determine, as columns, shape (6, k);
         shift and turn have no part in them.
-      faces: in the order of `FACES`.
+      faces: those that the shelf has, in the order of `FACES`.
     """
 
     camera: Camera
@@ -336,17 +341,18 @@ class _Fit:
             _vector(self.turn),
             scale @ covariance @ scale,
             free,
-            tuple(self._seen(face) for face in FACES),
+            tuple(self._seen(face) for face in faces_of(self.shelf)),
         )
 
     def _turn_by_normals(self, within: float) -> None:
         """A step towards the rotation that turns the patches' normals into those of the faces nearest to them."""
         points, normals = self.moved()
         near = np.zeros(len(points), bool)
-        for face in FACES:
+        faces = faces_of(self.shelf)
+        for face in faces:
             near |= face.across(self.shelf, points, REACH) & (np.abs(face.height(self.shelf, points)) < 2 * REACH)
         normals, pixels = normals[near], self.pixels[near]
-        axes = np.stack([face.normal for face in FACES])
+        axes = np.stack([face.normal for face in faces])
         cosines = normals @ axes.T
         best = cosines.argmax(axis=1) if len(cosines) else np.zeros(0, int)
         angle = np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)) if len(cosines) else np.zeros(0)
@@ -394,7 +400,7 @@ class _Fit:
 
     def _shift_to_faces(self) -> list[Face]:
         """Shift the points so that the faces are in their places; return the faces that agree."""
-        seen = {face: place for face in FACES if (place := self._outermost(face)) is not None}
+        seen = {face: place for face in faces_of(self.shelf) if (place := self._outermost(face)) is not None}
         used: list[Face] = []
         shift = np.zeros(3)
         for axis in range(3):

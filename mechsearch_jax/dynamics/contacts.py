@@ -151,7 +151,8 @@ def wall_depth(shelf, prints):
     shapes = in_world(prints)
     outline = outline_points(shapes)
     x, y = outline[..., 0], outline[..., 1]
-    depth = jnp.stack([x - shelf.back, shelf.right - y, y - shelf.left], axis=-1)
+    walls = shelf.walls
+    depth = jnp.stack([x - walls.back, walls.right - y, y - walls.left], axis=-1)
     if prints.parts is None:
         return depth, outline
     n = prints.valid.size

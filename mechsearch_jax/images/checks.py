@@ -25,10 +25,11 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, measured, rays
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import enters
 
 # A hole counts if a square of this side at the middle of the board fits into it [m]: a small object.
 SMALL = 0.025
-# Rays that enter the shelf this close to the edges of its opening do not count [m].
+# Rays that enter the shelf this close to the edges of an opening do not count [m].
 RIM = 0.01
 
 
@@ -244,11 +245,6 @@ def unmeasured_target_faults(look: Look, observation: Observation) -> tuple[str,
 
 
 def _into_shelf(part: Part) -> Bool[np.ndarray, "h w"]:
-    """Which rays enter the shelf's free space through its opening."""
-    camera, shelf = part.view.camera, part.look.shelf
-    ways, place = np.asarray(rays(camera)), np.array(camera.position)
-    # A camera in the shelf looks through no opening.
-    at = (shelf.front - place[0]) / np.where(ways[..., 0] > 1e-6, ways[..., 0], np.inf)
-    _, y, z = np.moveaxis(place + np.maximum(at, 0.0)[..., None] * ways, -1, 0)
-    inside = (y > shelf.right + RIM) & (y < shelf.left - RIM) & (z > shelf.board + RIM) & (z < shelf.ceiling - RIM)
-    return inside & ((ways[..., 0] > 1e-6) | (place[0] > shelf.front))
+    """Which rays enter the shelf's free space through an opening."""
+    camera = part.view.camera
+    return enters(part.look.shelf, np.array(camera.position), np.asarray(rays(camera)), RIM)

@@ -220,7 +220,8 @@ def within_shelf(target: Target, placement: Placement, shelf: Shelf) -> Bool[Arr
     """Whether a target is inside of the shelf, or open before it, but for `INTO_SHELF`."""
     against, along = target.solid.extent(placement.rotation, jnp)
     low, high = placement.centre - against, placement.centre + along
-    faces = (low[2] - shelf.board, low[1] - shelf.right, shelf.left - high[1], shelf.back - high[0])
+    walls = shelf.walls
+    faces = (low[2] - shelf.board, low[1] - walls.right, walls.left - high[1], walls.back - high[0])
     return jnp.all(jnp.stack([jnp.asarray(face) for face in faces]) > -INTO_SHELF)
 
 

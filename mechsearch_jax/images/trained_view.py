@@ -17,7 +17,7 @@ from mechsearch_jax.images.cloud import density, distance, middle, shelf_view, t
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.tables import checked
 from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.shelf import FACES, Shelf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,12 +100,14 @@ def view_faults(camera: Camera, shelf: Shelf, trained: Mapping[str, TrainedView]
       InputError: the camera does not see the shelf.
     """
     numbers = TrainedView(thinned_view(camera, shelf).camera, shelf).numbers()
+    bounds = {"depth": ("back",), "width": ("right", "left"), "height": ("ceiling",)}
+    unbounded = [name for name, faces in bounds.items() if not set(faces) <= set(shelf.faces)]
     lines: dict[str, list[str]] = {}
     for network, view in trained.items():
         usual = view.numbers()
         for name, tolerance in TOLERANCES.items():
             low, high = tolerance.range(usual[name])
-            if not low <= numbers[name] <= high:
+            if name not in unbounded and not low <= numbers[name] <= high:
                 value, *ends = (tolerance.form.format(number) for number in (numbers[name], low, high, usual[name]))
                 line = f"{tolerance.what} {value}, outside of {ends[0]} to {ends[1]} (trained at {ends[2]})"
                 lines.setdefault(line, []).append(network)
@@ -121,9 +123,11 @@ def read_view(card: Mapping[str, Any], where: str) -> TrainedView | None:
     if "view" not in card:
         return None
     entry = _table(card["view"], ("camera", "shelf"), f"{where}: view")
+    # Cards that do not name its faces are of a shelf with all of them.
+    shelf = {"faces": list(FACES)} | entry["shelf"] if isinstance(entry["shelf"], dict) else entry["shelf"]
     return TrainedView(
         _record(Camera, entry["camera"], f"{where}: view: camera"),
-        _record(Shelf, entry["shelf"], f"{where}: view: shelf"),
+        _record(Shelf, shelf, f"{where}: view: shelf"),
     )
 
 

@@ -136,13 +136,14 @@ def push_start(
       T_world_gripper: first pose.
       displacement: of the gripper [m]; the vertical component is neglected.
     """
+    walls = shelf.walls
     return PushStart(
         prints=footprints(scene),
         tilt=10.0 * (1.0 - jnp.max(jnp.abs(scene.rotation[:, 2, :]), axis=-1)),
         points=transform(T_world_gripper, pusher[:POINTS]),
         T_world_gripper=T_world_gripper,
         displacement=displacement[:2],
-        faces=jnp.array([-shelf.back, shelf.right, -shelf.left, shelf.front]),
+        faces=jnp.array([-walls.back, walls.right, -walls.left, shelf.front]),
         board=jnp.float32(shelf.board),
     )
 

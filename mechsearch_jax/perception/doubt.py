@@ -24,6 +24,7 @@ from mechsearch_jax.shapes.solid import Solid
 from mechsearch_jax.workspace.camera import Camera, back_project, measured
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import ends_in_shelf, enters
 from mechsearch_jax.workspace.target import Target
 
 # At most about so many pixels of the shelf's part of the image are used, spread evenly over it.
@@ -178,11 +179,11 @@ def recognition_doubt(
     if np.shape(depth) != (camera.height, camera.width):
         raise InputError(f"depth image: its shape is {np.shape(depth)}, not {(camera.height, camera.width)}")
     rays, depths = _seen(camera, shelf, np.asarray(depth, float))
-    known = measured(depths)
-    missing = 1.0 - float(known.mean()) if len(known) else 1.0
+    origin, known = np.array(camera.position, float), measured(depths)
+    judged = known[ends_in_shelf(shelf, origin, rays)]
+    missing = 1.0 - float(judged.mean()) if len(judged) else 1.0
     rays, depths = rays[known], depths[known]
     finite = np.isfinite(depths)
-    origin = np.array(camera.position, float)
     points = origin + depths[finite, None] * rays[finite]
     points = points[_on_the_board(shelf, points)]
     things = things_of(shelf, setting.target, observation)
@@ -260,11 +261,8 @@ def _seen(camera: Camera, shelf: Shelf, depth: np.ndarray) -> tuple[np.ndarray, 
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.array(camera.rotation, float).T
     depths = depth[np.ix_(rows, columns)].reshape(-1)
     # Beside the opening there may be nothing to measure.
-    ahead = np.maximum(rays[:, 0], 1e-9)
-    entry = np.array(camera.position) + (shelf.front - camera.position[0]) / ahead[:, None] * rays
-    wide = (entry[:, 1] > shelf.right) & (entry[:, 1] < shelf.left)
-    enters = wide & (entry[:, 2] > shelf.board) & (entry[:, 2] < shelf.ceiling)
-    return rays[enters], np.where(np.isnan(depths), 0.0, depths)[enters]
+    into = enters(shelf, np.array(camera.position), rays)
+    return rays[into], np.where(np.isnan(depths), 0.0, depths)[into]
 
 
 def _on_the_board(shelf: Shelf, points: np.ndarray) -> np.ndarray:

@@ -100,10 +100,11 @@ def edge_faults(
     reach = float(np.mean(beyond))
     if not reach >= BEYOND * max(1.0, longer(camera)):
         return ()
+    faces = ", and faces of the shelf seem to be" if shelf.faces else ""
     return (
         f"depth image: its edges lie {reach:.0f} pixels beyond those of the colour image, so that nearer things look "
-        "larger, as where a stereo camera matches blocks; things may be recognised centimetres too large or elsewhere, "
-        "and faces of the shelf seem to be: let the camera match smaller blocks, or leave out the depth beside edges",
+        f"larger, as where a stereo camera matches blocks; things may be recognised centimetres too large or elsewhere"
+        f"{faces}: let the camera match smaller blocks, or leave out the depth beside edges",
     )
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mechsearch_jax.calibration.fit import FACES, Face
+from mechsearch_jax.calibration.fit import Face, faces_of
 from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.detection import fitted_pose
@@ -20,9 +20,10 @@ from mechsearch_jax.images.planes import TOLERANCE, find_plane
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.camera import Camera, project, rays
 from mechsearch_jax.workspace.detector import found_pixels
-from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.shelf import FACES, Shelf
+from mechsearch_jax.workspace.sight import ends_in_shelf
 from mechsearch_jax.workspace.target import Target
 
 # The board is searched within this distance of its height [m], among at most so many points, and counts as seen with so
@@ -56,9 +57,6 @@ PATCH_PIXELS = (0.4, 1.6)
 EMPTY_SHELF = "the shelf is empty: no object and no target is seen"
 
 
-WALLS = tuple(face for face in FACES if face.axis != 2)
-
-
 def image_faults(look: Look) -> tuple[str, ...]:
     """Warnings about a depth image and a mask that do not fit camera and shelf.
 
@@ -72,16 +70,21 @@ def image_faults(look: Look) -> tuple[str, ...]:
             "depth image: nothing was measured where it shows the shelf; it must hold metres along the camera's axis, "
             "and the sensor must be able to see the shelf"
         )
-    if measured.mean() < LEAST_MEASURED:
+    view, judged = look.whole.view.camera, measured
+    if set(shelf.faces) < set(FACES):
+        judged = measured[ends_in_shelf(shelf, np.array(view.position), np.asarray(rays(view)))]
+    if judged.mean() < LEAST_MEASURED:
         return (
-            f"depth image: {100 * measured.mean():.0f}% of the pixels that show the shelf have a depth; it must be in "
+            f"depth image: {100 * judged.mean():.0f}% of the pixels that show the shelf have a depth; it must be in "
             "metres along the camera's axis, and the sensor must be able to see the shelf",
         )
     points = look.whole.points[measured]
     floor = _floor_fault(shelf, points)
     # If the board is not at its place, the walls are not either.
-    walls = [_edge_fault(camera, shelf, points), *(_wall_fault(shelf, wall, points) for wall in WALLS)]
-    faults = [floor] if floor else walls
+    walls = [_wall_fault(shelf, face, points) for face in faces_of(shelf) if face.axis != 2]
+    # A board without any face is a part of a table top, whose edge may be elsewhere.
+    edge = _edge_fault(camera, shelf, points) if shelf.faces else None
+    faults = [floor] if floor else [edge, *walls]
     x, y, z = points.T
     within = (x > shelf.front) & (x < shelf.back) & (y > shelf.right) & (y < shelf.left) & (z < shelf.ceiling)
     if mask is not None and (z[within] > shelf.board + 2 * FLOOR_TOLERANCE).any() and not (mask >= 0).any():

@@ -317,11 +317,12 @@ def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: Ref
     deviation = jnp.array([config.tilt_prior, config.tilt_prior, config.yaw_prior])
     x, y, z = shape.position
     height = (z - _support(shape, (0.0, 0.0, 1.0)) - shelf.board) / config.contact
-    walls = jnp.stack(
+    walls = shelf.walls
+    beyond = jnp.stack(
         [
-            x + _support(shape, (1.0, 0.0, 0.0)) - shelf.back,
-            y + _support(shape, (0.0, 1.0, 0.0)) - shelf.left,
-            shelf.right - y + _support(shape, (0.0, 1.0, 0.0)),
+            x + _support(shape, (1.0, 0.0, 0.0)) - walls.back,
+            y + _support(shape, (0.0, 1.0, 0.0)) - walls.left,
+            walls.right - y + _support(shape, (0.0, 1.0, 0.0)),
         ]
     )
     out_of_round = (shape.log_size[0] - shape.log_size[1]) * jnp.where(shape.exponents[1] > EDGE, 100.0, 0.0)
@@ -330,7 +331,7 @@ def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: Ref
             (shape.log_size - guess.log_size) / config.size_prior,
             (shape.position - guess.position) / config.position_prior,
             angle / deviation,
-            jnp.maximum(walls, 0.0) / config.noise,
+            jnp.maximum(beyond, 0.0) / config.noise,
             # Bounded, so that objects on other objects are not pulled down to the board.
             5.0 * jnp.arctan(height / 5.0)[None],
             out_of_round[None],

@@ -184,11 +184,12 @@ def _shelf_clearance(shelf: Shelf, centres: np.ndarray, radius: np.ndarray) -> n
 def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     """Distance to the shelf's solid parts, negative inside; beside its free space, to the front plane."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    to_wall = np.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
-    to_board = np.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    walls = shelf.walls
+    to_wall = np.minimum(y - walls.right, walls.left - y) - shelf.side_margin
+    to_board = np.minimum(z - shelf.board, walls.ceiling - z - shelf.ceiling_margin)
     beside, before = np.minimum(to_wall, to_board), shelf.front - x
     in_front = np.hypot(np.maximum(beside, 0.0), before)
-    return np.where(before > 0.0, in_front, np.minimum(beside, shelf.back - x))
+    return np.where(before > 0.0, in_front, np.minimum(beside, walls.back - x))
 
 
 def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:

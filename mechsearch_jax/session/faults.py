@@ -119,9 +119,9 @@ def recognition_warnings(setting: Setting, look: Look, observation: Observation,
             other += detection_faults(look, observation)
     # Another recogniser may know of things that the images do not show.
     if isinstance(recogniser, Recogniser) and not shows_nothing(observation):
-        other += lost_faults(setting, observation, look.depth)
-    of_shapes = [*_crowd_warnings(observation), *shape_warnings(observation)]
-    return [*other, *of_shapes, *overlap_faults(setting, observation)]
+        lost = lost_faults(setting, observation, look.depth)
+        other += [*lost, *(_crowd_warnings(observation) if lost else ())]
+    return [*other, *shape_warnings(observation), *overlap_faults(setting, observation)]
 
 
 def belief_warnings(before: Belief, after: Belief, shelf_is_empty: bool) -> list[str]:
@@ -141,4 +141,4 @@ def _crowd_warnings(observation: Observation) -> list[str]:
     slots = observation.objects.capacity
     if not bool(jnp.all(observation.objects.valid)):
         return []
-    return [f"recognition: all {slots} slots are taken; objects beyond the largest {slots} are not seen"]
+    return [f"recognition: all {slots} slots are taken, so that nothing else can be an object; see what lies on none"]

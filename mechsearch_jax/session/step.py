@@ -128,7 +128,7 @@ class SearchStep:
         """The image, f and g from above, and the action."""
         from mechsearch_jax.viz.filmstrip import filmstrip
 
-        heading = "; ".join(self.warnings) or "What the robot sees, and what it is to do"
+        heading = "\n".join(self.warnings) or "What the robot sees, and what it is to do"
         return filmstrip([self.frame], self.problem.camera, self.problem.shelf, self.problem.target, heading)
 
 

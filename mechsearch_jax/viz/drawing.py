@@ -6,6 +6,8 @@ Pictures from above are oriented as for the robot: the shelf's open front at the
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -154,10 +156,13 @@ def draw_shelf(axes: Axes, shelf: Shelf) -> None:
     axes.add_patch(
         patches.Rectangle((right, front), left - right, back - front, facecolor=BOARD, linewidth=0, zorder=0)
     )
-    axes.plot(
-        [left, left, right, right], [front, back, back, front], color=WALL, linewidth=3.5, solid_joinstyle="miter"
-    )
-    axes.plot([left, right], [front, front], color=WALL, linewidth=1, linestyle=(0, (4, 3)))
+    corners = ((left, front), (left, back), (right, back), (right, front), (left, front))
+    # As few strokes as there are styles, so that walls join at corners.
+    for is_wall, style in ((True, {"linewidth": 3.5}), (False, {"linewidth": 1, "linestyle": (0, (4, 3))})):
+        line = list[tuple[float, float]]()
+        for face, ends in zip(("left", "back", "right", "front"), itertools.pairwise(corners), strict=True):
+            line += ends if (face in shelf.faces) == is_wall else [(math.nan, math.nan)]
+        axes.plot(*zip(*line, strict=True), color=WALL, solid_joinstyle="miter", **style)
     axes.text(
         left - 0.01, front - 0.75 * ROBOT_STRIP, "robot's side", color=MUTED, fontsize=LETTER, ha="left", va="center"
     )

@@ -23,8 +23,8 @@ from mechsearch_jax.workspace.target import Target
 # Width of the figure [inches]: all text is legible at 100 dots per inch.
 WIDTH = 10.0
 _HEADING, _GAP, _BETWEEN, _LEGEND = 0.42, 0.14, 0.06, 0.8
-# Distance of lines of text, in units of the font size.
-_LEADING = 1.4
+# Distance of lines of text, in units of the font size, which is at least this in a heading [pt].
+_LEADING, _SMALLEST = 1.4, 9.5
 # Width of a letter, in units of the font size.
 _LETTER, _BOLD_LETTER = 0.54, 0.575
 
@@ -68,7 +68,7 @@ def filmstrip(
     Args:
       frames: the steps, at least one; a single step has its two pictures side by side.
       camera, shelf, target: of the problem.
-      heading: one line at the top.
+      heading: at the top, in larger letters if it is one line that fits.
       columns: largest number of steps side by side; lines are filled evenly.
 
     Returns:
@@ -82,21 +82,28 @@ def filmstrip(
     lines_of = [_lines(frame, width) for frame in frames]
     caption = _BETWEEN + max(sum(_LEADING * size / 72 for _, size, *_ in texts) for texts in lines_of)
     layout = _layout(columns, width, caption, drawing.view_window(camera, shelf, room), drawing.map_share(shelf))
-    height = _HEADING + lines * layout.height + _LEGEND
+    across = 72.0 * (WIDTH - 2 * _GAP) / _BOLD_LETTER
+    size = min(13.0, across / max(len(heading), 1))
+    if size < _SMALLEST or "\n" in heading:
+        size = _SMALLEST
+        wrapped = textwrap.TextWrapper(int(0.95 * across / size), subsequent_indent="    ")
+        heading = "\n".join(wrapped.fill(line) for line in heading.splitlines())
+    more = heading.count("\n") * _LEADING * size / 72
+    height = _HEADING + more + lines * layout.height + _LEGEND
     figure = Figure(figsize=(WIDTH, height), facecolor=drawing.PAPER)
-    fits = 72.0 * (WIDTH - 2 * _GAP) / (_BOLD_LETTER * max(len(heading), 1))
     figure.text(
         _GAP / WIDTH,
-        1 - 0.22 / height,
+        1 - (0.22 + more / 2) / height,
         heading,
-        fontsize=min(13.0, fits),
+        fontsize=size,
         color=drawing.INK,
         weight="bold",
         va="center",
+        linespacing=_LEADING,
     )
     for i, frame in enumerate(frames):
         x = _GAP + (i % columns) * (layout.width + _GAP)
-        y = height - _HEADING - (i // columns) * layout.height
+        y = height - _HEADING - more - (i // columns) * layout.height
         _write(figure, x, y, lines_of[i])
         view, above = (
             figure.add_axes(((x + a) / WIDTH, (y - b) / height, w / WIDTH, h / height))

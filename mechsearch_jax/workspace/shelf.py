@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,28 @@ FARTHEST, THICKEST = 10.0, 0.5
 # The fields that are numbers, and those that are ranges; all are dynamic under `jit`.
 _NUMBERS = ("front", "back", "right", "left", "board", "ceiling", "thickness", "side_margin", "ceiling_margin")
 _RANGES = ("spawn_x", "spawn_y")
+# The faces that may be missing; a missing one is this far away for all that faces stop or hide [m].
+FACES = ("back", "right", "left", "ceiling")
+AWAY = 100.0
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=(*_NUMBERS, *_RANGES), meta_fields=())
+class Walls(NamedTuple):
+    """Where the faces in `FACES` are [m]; those that a shelf does not have are `AWAY` from their places."""
+
+    back: Any
+    right: Any
+    left: Any
+    ceiling: Any
+
+
 @dataclasses.dataclass(frozen=True)
 class Shelf:
     """Inner faces of the shelf in the robot's base frame [m]; +x points into the shelf, z up (docs/method.md,
     "Facts of the scene").
 
-    A pytree, so that a shelf with other measures recompiles nothing where a jitted function takes it as a dynamic
-    argument. Outside of tracing it holds plain numbers and is hashable.
+    A pytree, so that a shelf with other measures or faces recompiles nothing where a jitted function takes it as a
+    dynamic argument. Outside of tracing it holds plain numbers and is hashable. Where a face is missing, its place
+    still bounds what is searched and where things are put: a board without faces is a part of a table top.
 
     Attributes:
       front: x of the board's front edge.
@@ -42,6 +54,7 @@ class Shelf:
       ceiling_margin: the planner's distance from the upper board.
       spawn_x: range of x in which the generator drops object centres.
       spawn_y: the same for y.
+      faces: which of `FACES` there are; the others stop no motion, hide nothing and are not looked for in images.
     """
 
     front: float = 0.414
@@ -55,10 +68,11 @@ class Shelf:
     ceiling_margin: float = 0.011
     spawn_x: tuple[float, float] = (0.45, 0.73)
     spawn_y: tuple[float, float] = (-0.18, 0.38)
+    faces: tuple[str, ...] = FACES
 
     def __post_init__(self):
         # In a pytree rebuilt by JAX, fields may hold tracers or other stand-ins, which are not checked.
-        if not are_given(*(getattr(self, name) for name in (*_NUMBERS, *_RANGES))):
+        if not are_given(*(getattr(self, name) for name in (*_NUMBERS, *_RANGES, "faces"))):
             return
         for name in ("front", "back", "right", "left", "board", "ceiling"):
             check_range(f"Shelf: {name}", getattr(self, name), -FARTHEST, FARTHEST, "m")
@@ -76,6 +90,32 @@ class Shelf:
             object.__setattr__(self, name, float(getattr(self, name)))
         for name in _RANGES:
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
+        object.__setattr__(self, "faces", self._named_faces())
+
+    def _named_faces(self) -> tuple[str, ...]:
+        """The faces' names in the order of `FACES`, from names or from the pytree's numbers."""
+        if not any(isinstance(face, str) for face in self.faces) and len(self.faces) == len(FACES):
+            return tuple(name for name, is_there in zip(FACES, self.faces, strict=True) if is_there)
+        if isinstance(self.faces, str) or not set(self.faces) <= set(FACES):
+            raise InputError(f"Shelf: faces {self.faces!r} must be a list of those there are of {', '.join(FACES)}")
+        return tuple(name for name in FACES if name in self.faces)
+
+    @property
+    def _are_there(self) -> tuple[Any, ...]:
+        """1 for each of `FACES` that there is, else 0."""
+        if all(isinstance(face, str) for face in self.faces):
+            return tuple(float(name in self.faces) for name in FACES)
+        return self.faces
+
+    @property
+    def walls(self) -> Walls:
+        """What stops motions and hides things; all numbers, or arrays if the shelf is traced."""
+        away = [AWAY * (1.0 - is_there) for is_there in self._are_there]
+        return Walls(self.back + away[0], self.right - away[1], self.left + away[2], self.ceiling + away[3])
+
+    def is_open(self, face: str) -> Any:
+        """Whether one of `FACES` is missing; an array if the shelf is traced."""
+        return self._are_there[FACES.index(face)] < 0.5
 
     def moved(self, shift: tuple[float, float, float]) -> Shelf:
         """The same shelf elsewhere, by a translation in the world [m]."""
@@ -91,6 +131,27 @@ class Shelf:
             spawn_x=(self.spawn_x[0] + x, self.spawn_x[1] + x),
             spawn_y=(self.spawn_y[0] + y, self.spawn_y[1] + y),
         )
+
+
+def _flatten(shelf: Shelf) -> tuple[tuple[Any, ...], None]:
+    return (*(getattr(shelf, name) for name in (*_NUMBERS, *_RANGES)), shelf._are_there), None
+
+
+def _flatten_with_keys(shelf: Shelf) -> tuple[tuple[Any, ...], None]:
+    names = (jax.tree_util.GetAttrKey(name) for name in (*_NUMBERS, *_RANGES, "faces"))
+    return tuple(zip(names, _flatten(shelf)[0], strict=True)), None
+
+
+jax.tree_util.register_pytree_with_keys(Shelf, _flatten_with_keys, lambda _, fields: Shelf(*fields), _flatten)
+
+
+def past_open_side(
+    shelf: Shelf, x: Float[Array, "*batch"], y: Float[Array, "*batch"], margin: float
+) -> Bool[Array, "*batch"]:
+    """Whether places are beyond the board's edge at the back or a side without a wall, or at most `margin` [m] before
+    it: what stands there may fall."""
+    gaps = {"back": shelf.back - x, "right": y - shelf.right, "left": shelf.left - y}
+    return jnp.any(jnp.stack([(gap < margin) & shelf.is_open(face) for face, gap in gaps.items()]), axis=0)
 
 
 def on_host(shelf: Shelf, *row: int) -> Shelf:
@@ -121,12 +182,13 @@ def cloud_hits_shelf(
 def _in_shelf(
     shelf: Shelf, x: Float[Array, "*batch"], y: Float[Array, "*batch"], z: Float[Array, "*batch"]
 ) -> Bool[Array, "*batch"]:
+    walls = shelf.walls
     inside = (
-        (x <= shelf.back)
-        & (y >= shelf.right + shelf.side_margin)
-        & (y <= shelf.left - shelf.side_margin)
+        (x <= walls.back)
+        & (y >= walls.right + shelf.side_margin)
+        & (y <= walls.left - shelf.side_margin)
         & (z >= shelf.board)
-        & (z <= shelf.ceiling - shelf.ceiling_margin)
+        & (z <= walls.ceiling - shelf.ceiling_margin)
     )
     return (x > shelf.front) & ~inside
 
@@ -153,9 +215,10 @@ def placed_spheres_hit_shelf(
     radii: Float[Array, " n"],
 ) -> Bool[Array, "*batch n"]:
     """`spheres_hit_shelf` with one array for each coordinate of the centres."""
-    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
-    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    walls = shelf.walls
+    to_wall = jnp.minimum(y - walls.right, walls.left - y) - shelf.side_margin
+    to_board = jnp.minimum(z - shelf.board, walls.ceiling - z - shelf.ceiling_margin)
     beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
     before = jnp.maximum(shelf.front - x, 0.0)
     radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
-    return (beside**2 + before**2 < radii**2) | (x + radii > shelf.back)
+    return (beside**2 + before**2 < radii**2) | (x + radii > walls.back)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -26,6 +26,9 @@ SLACK = 0.02
 BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 OPENGL = np.diag([1.0, -1.0, -1.0])
 AXES = "its frame must have x right, y down and z forward"
+
+# Sides through which one may look into the space where they have no face: their axes, and signs of the way in.
+_SIDES = (("front", 0, 1), ("back", 0, -1), ("right", 1, 1), ("left", 1, -1), ("ceiling", 2, -1))
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
@@ -107,17 +110,64 @@ def _sight(camera: Camera, pose: Pose, shelf: Shelf) -> Sight:
     safe = np.maximum(depth, 1e-6)
     row, column = camera.fy * down / safe + camera.cy, camera.fx * right / safe + camera.cx
     framed = (row >= 0.0) & (row < camera.height) & (column >= 0.0) & (column < camera.width) & (depth > 0)
-    # The line of sight must pass the plane of the front within the opening.
-    way = board - position
-    share = (shelf.front - position[0]) / np.where(way[:, 0] > 1e-9, way[:, 0], np.inf)
-    crossing = position + share[:, None] * way
-    opening = (crossing[:, 1] > shelf.right - SLACK) & (crossing[:, 1] < shelf.left + SLACK)
-    opening &= (crossing[:, 2] > shelf.board - SLACK) & (crossing[:, 2] < shelf.ceiling + SLACK)
-    inside = _in_space(position, shelf)
-    seen = framed & (inside | (opening & (position[0] <= shelf.front)))
+    seen = framed & enters(shelf, position, board - position, -SLACK)
     towards = middle - position
     central = towards @ rotation[:, 2] / max(float(np.linalg.norm(towards)), 1e-9)
     return Sight(float(central), float(framed.mean()), float(seen.mean()))
+
+
+def enters(
+    shelf: Shelf, place: Float[np.ndarray, "3"], ways: Float[np.ndarray, "*batch 3"], margin: float = 0.0
+) -> Bool[np.ndarray, "*batch"]:
+    """Which rays enter the shelf's space through its front, or a side without a face, or begin in it.
+
+    Args:
+      shelf: the shelf.
+      place: where the rays begin [m].
+      ways: their directions, of any length.
+      margin: how far inside of such a side's edges they must pass [m].
+    """
+    ends = (shelf.front, shelf.right, shelf.board), (shelf.back, shelf.left, shelf.ceiling)
+    entered = np.full(ways.shape[:-1], _in_space(place, shelf))
+    for face, axis, inward in _SIDES:
+        if face in shelf.faces:
+            continue
+        is_towards = inward * ways[..., axis] > 1e-9
+        time = (ends[inward < 0][axis] - place[axis]) / np.where(is_towards, ways[..., axis], np.inf)
+        crossing = place + time[..., None] * ways
+        entered |= (
+            is_towards
+            & (time >= 0.0)
+            & np.all(
+                [
+                    (crossing[..., k] > ends[0][k] + margin) & (crossing[..., k] < ends[1][k] - margin)
+                    for k in {0, 1, 2} - {axis}
+                ],
+                axis=0,
+            )
+        )
+    return entered
+
+
+def ends_in_shelf(
+    shelf: Shelf, place: Float[np.ndarray, "3"], ways: Float[np.ndarray, "*batch 3"]
+) -> Bool[np.ndarray, "*batch"]:
+    """Which rays, of those that `enters` is true of, would end on the board or on a face if nothing stood on it; behind
+    a side without a face there may be nothing to measure."""
+    walls, ends = shelf.walls, np.full(ways.shape[:-1], np.inf)
+    for axis, face, outward in (
+        (2, shelf.board, -1),
+        (0, walls.back, 1),
+        (1, walls.right, -1),
+        (1, walls.left, 1),
+        (2, walls.ceiling, 1),
+    ):
+        is_towards = outward * ways[..., axis] > 1e-9
+        time = (face - place[axis]) / np.where(is_towards, ways[..., axis], 1.0)
+        ends = np.minimum(ends, np.where(is_towards, time, np.inf))
+    x, y, z = np.moveaxis(place + ends[..., None] * ways, -1, 0)
+    near = (x > shelf.front - SLACK) & (x < shelf.back + SLACK) & (y > shelf.right - SLACK) & (y < shelf.left + SLACK)
+    return near & (z < shelf.ceiling + SLACK)
 
 
 def _in_space(position: Float[np.ndarray, "3"], shelf: Shelf) -> bool:

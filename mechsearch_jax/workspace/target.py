@@ -393,7 +393,7 @@ class Target:
                 f"Target: it reaches {self.solid.radius:.3f} m from its middle, too far for a board of {deep:g} m x"
                 f" {wide:g} m; use a smaller one, or write its scale, if it is in another unit"
             )
-        room = float(shelf.ceiling - shelf.board)
+        room = float(shelf.walls.ceiling - shelf.board)
         if self.tall > room:
             raise InputError(
                 f"Target: {self.tall:.3f} m tall, but the shelf is {room:.3f} m high inside; use a lower one"

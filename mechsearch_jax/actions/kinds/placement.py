@@ -29,7 +29,7 @@ from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform, 
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf, hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf, hits_shelf, past_open_side
 
 # A body that stands nearer to the front edge than this share of its height may fall over the edge.
 EDGE_SHARE = 0.25
@@ -124,6 +124,7 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     points = transform(make(rotation, position)[:, None], cloud[None])
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
     on_board &= jnp.min(points[..., 0], axis=1) > shelf.front + config.clearance
+    on_board &= ~jnp.any(past_open_side(shelf, points[..., 0], points[..., 1], config.clearance), axis=1)
     obstacles = scene.valid & (jnp.arange(scene.capacity) != index) & grasp.wanted
     wider = enlarged(scene, config.clearance)
     mask = obstacles[None] & on_board[:, None]

@@ -45,7 +45,7 @@ from mechsearch_jax.robot.entry import (
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
-from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf, past_open_side
 
 # A push within these angles of +x or -x starts behind the object, any other beside it [rad].
 BEHIND = (math.radians(75), math.radians(45))
@@ -430,7 +430,7 @@ class Push(SampledKind):
         """The prediction of the push model, and whether the push is possible.
 
         It is impossible if the arm cannot follow, or if the push jams, tips an object, moves an untouchable one, pushes
-        one to the front edge, or makes the gripper hit one that stays; or if the prediction is not finite.
+        one to an edge without a wall, or makes the gripper hit one that stays; or if the prediction is not finite.
         """
         pushes = action.kind == CODE
         # A push model that simulates has less to do where nothing is pushed.
@@ -440,7 +440,8 @@ class Push(SampledKind):
         config = space.config
         allowed = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
         spoiled = ~allowed | jnp.any(moved & untouchable)
-        spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
+        x, y, _ = pushed.scene.position.T
+        spoiled |= jnp.any(moved & ((x < space.shelf.front + EDGE) | past_open_side(space.shelf, x, y, EDGE)))
         spoiled |= gripper_meets(space, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
 
         def free(shelf, push, _):

@@ -343,8 +343,9 @@ def _fits_in(parts: Superquadrics, shelf: Shelf) -> Bool[Array, "*batch"]:
     # The rows of the rotation are the world's axes in the shape's frame.
     reach = superquadric.support(parts.size[..., None, :], parts.exponents[..., None, :], parts.rotation)
     low, high = parts.position - reach + INTO_WALLS, parts.position + reach - INTO_WALLS
-    stands = (low[..., 2] >= shelf.board) & (high[..., 0] <= shelf.back)
-    return stands & (low[..., 1] >= shelf.right) & (high[..., 1] <= shelf.left)
+    walls = shelf.walls
+    stands = (low[..., 2] >= shelf.board) & (high[..., 0] <= walls.back)
+    return stands & (low[..., 1] >= walls.right) & (high[..., 1] <= walls.left)
 
 
 def _chosen(
