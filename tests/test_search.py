@@ -34,6 +34,7 @@ from mechsearch_jax.images.measured import share_step
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.plausibility import image_faults
+from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.step import DRAWS
@@ -138,6 +139,16 @@ def test_without_an_action_it_says_why(problem):
     assert step.kind == "none"
     assert "something stands on the shelf, but no object and no target is recognised" in step.reason
     assert any("open again" in warning for warning in step.warnings)
+
+
+def test_that_all_slots_are_taken_is_said_only_where_something_is_on_none_of_them(problem, monkeypatch):
+    hidden = seen(HIDDEN)
+    full = hidden.replace(objects=hidden.objects.replace(valid=jnp.ones(8, bool), size=jnp.full((8, 3), 0.01)))
+    look = Look(CAMERA, SHELF, IMAGES.depth)
+    for lost in ((), ("recognition: what shows 300 pixels does not lie on anything that is recognised",)):
+        monkeypatch.setattr(faults, "lost_faults", lambda *_, lost=lost: lost)
+        said = recognition_warnings(problem, look, full, object.__new__(Recogniser))
+        assert any("all 8 slots are taken" in line for line in said) == bool(lost)
 
 
 def test_what_does_not_tell_the_target_is_a_warning():

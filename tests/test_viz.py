@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
@@ -284,6 +285,19 @@ def test_an_action_is_drawn_into_both_pictures(action, arrows):
     figure = filmed(frame(Target.cylinder(), **shown(action)))
     for axes in figure.axes:
         assert sum(isinstance(p, FancyArrowPatch) for p in axes.patches) == arrows
+
+
+def test_warnings_are_legible_and_inside_the_picture():
+    lines = [f"warning {k}: " + "what is said of it " * 14 for k in range(4)]
+    for heading in ("\n".join(lines), " ".join(lines), "short", "one\ntwo"):
+        figure = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), heading)
+        FigureCanvasAgg(figure).draw()
+        text = figure.texts[0]
+        box, whole = text.get_window_extent(), figure.bbox
+        assert text.get_fontsize() >= 9.0
+        assert 0 <= box.x0 < box.x1 <= whole.x1
+        assert max(axes.get_window_extent().y1 for axes in figure.axes) < box.y0 < box.y1 <= whole.y1
+        assert " ".join(text.get_text().split()) == " ".join(heading.split())
 
 
 def test_a_push_points_where_the_gripper_goes():

@@ -92,6 +92,12 @@ class Shelf:
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         object.__setattr__(self, "faces", self._named_faces())
 
+    def __repr__(self) -> str:
+        # Faces only where some are missing, so that searches that were saved before that could be go on.
+        are_all = all(isinstance(face, str) for face in self.faces) and self.faces == FACES
+        names = (*_NUMBERS, *_RANGES, *(() if are_all else ("faces",)))
+        return f"Shelf({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
+
     def _named_faces(self) -> tuple[str, ...]:
         """The faces' names in the order of `FACES`, from names or from the pytree's numbers."""
         if not any(isinstance(face, str) for face in self.faces) and len(self.faces) == len(FACES):
