@@ -20,6 +20,8 @@ Numbers = Array | np.ndarray
 
 # Gap below which things count as touching [m].
 TOUCH = 0.004
+# What stands on something may be recognised so far above or below its top [m].
+STACKED = 0.01
 
 
 class Footprints(PyTreeNode):
@@ -131,6 +133,58 @@ def turned(yaw: Float[Array, "..."], v: Float[Array, "... 2"]) -> Float[Array, "
 def dot(a, b):
     """Dot product of planar vectors, written out: a sum over an axis would be a separate kernel on a GPU."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def norm(v: Array) -> Array:
+    """Length of planar vectors; 0, with a gradient of 0, where they vanish."""
+    square = dot(v, v)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def reach(prints: Footprints, direction: Float[Array, "*other n 2"]) -> Float[Array, "*other n"]:
+    """How far footprints (N) reach from their centres along planar unit vectors [m]."""
+    lead = (1,) * (direction.ndim - 2)
+    yaw, half = prints.yaw.reshape(*lead, -1), prints.half.reshape(*lead, -1, 2)
+    along = dot(direction, jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1))
+    across = dot(direction, jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1))
+    parts = jnp.abs(jnp.stack([along, across], axis=-1)) * half
+    return jnp.where(prints.round.reshape(*lead, -1), norm(parts), parts[..., 0] + parts[..., 1])
+
+
+def overlapping(prints: Footprints) -> Bool[Array, "n n"]:
+    """Which footprints overlap by more than `TOUCH`, whatever their heights; for bodies of several parts the bounding
+    ones.
+
+    An approximation: ellipses that overlap by a little less with the corner of a rectangle count, too.
+    """
+    n, offset = prints.yaw.shape[0], prints.position[None] - prints.position[:, None]
+    apart = norm(offset)[..., None]
+    # Where both centres are the same, any direction tells as much.
+    between = jnp.where(apart > 1e-6, offset / jnp.maximum(apart, 1e-6), jnp.eye(1, 2)[None])
+    first = jnp.stack([jnp.cos(prints.yaw), jnp.sin(prints.yaw)], axis=-1)
+    axes = jnp.stack([first, turned(jnp.full(n, QUARTER_TURN), first)])[:, None]
+    axes = jnp.broadcast_to(axes, (2, n, n, 2))
+    # Along the line between both centres, the axes of the second, and those of the first.
+    normals = jnp.concatenate([between[None], axes, jnp.swapaxes(axes, 1, 2)])
+    of_first = jnp.swapaxes(reach(prints, jnp.swapaxes(normals, 1, 2)), 1, 2)
+    common = of_first + reach(prints, normals) - jnp.abs(dot(normals, offset[None]))
+    return jnp.min(common, axis=0) > TOUCH
+
+
+def supports(prints: Footprints) -> Bool[Array, "n n"]:
+    """Which object (row) carries which (column).
+
+    The lowest point of what is carried is within `STACKED` of a top, and above the middle of what has it; from above
+    both overlap. Bodies of several parts carry with any part, and stand on those that reach down to their lowest point.
+    Nothing whose lowest point is on the board is carried, however it leans.
+    """
+    shapes, parts = in_world(prints), 1 if prints.parts is None else prints.parts.valid.shape[1]
+    foot = jnp.repeat(prints.low, parts) if parts > 1 else prints.low
+    stands = shapes.valid & (shapes.low < foot + STACKED)
+    carries = shapes.valid[:, None] & stands[None] & overlapping(shapes)
+    carries &= jnp.abs(foot[None] - shapes.high[:, None]) < STACKED
+    carries &= foot[None] > 0.5 * (foot + shapes.high)[:, None]
+    return jnp.any(carries.reshape(-1, parts, prints.valid.shape[0], parts), axis=(1, 3)) if parts > 1 else carries
 
 
 def extents(scene: Superquadrics, directions: Float[Array, "*#n 3 d"]) -> Float[Array, "n d"]:

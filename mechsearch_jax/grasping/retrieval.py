@@ -25,6 +25,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters_unmeasured
 from mechsearch_jax.geometry.bodies import enlarged, slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.footprints import footprints, supports
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, transform, upright_pose
@@ -38,6 +39,7 @@ from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import body_at
 
 # Largest number of grasps that are tried.
 TRIES = 8
@@ -208,7 +210,8 @@ def found_hits(
     previous: Bool[Array, "f n"] | None = None,
     moved: Bool[Array, " n"] | None = None,
 ) -> Bool[Array, "f n"]:
-    """Which objects each grasp of a found target hits on its whole way; grasps that are not feasible hit none.
+    """Which objects each grasp of a found target hits on its whole way, and what the target carries; grasps that are
+    not feasible hit none.
 
     Args:
       grasps: the grasps, as in `found_grasps`.
@@ -225,12 +228,23 @@ def found_hits(
     hits = straight_hits(grasps.tables, found, fresh, here)
     feasible = found.feasible & here
     hits |= crossing_hits(grasps.tables, grasps.gripper, fresh, found.T_world_target, feasible)
+    hits |= feasible[:, None] & carried(grasps, found.T_world_target, fresh)[None]
 
     def touches(_, scene, q):
         return jnp.any(arm_hits(q, scene), axis=0)
 
     hits |= masked_vmap(touches, feasible & jnp.any(fresh.valid), None, fresh, found.q, block=16)
     return hits if previous is None or moved is None else jnp.where(moved[None], hits, previous)
+
+
+def carried(grasps: TargetGrasps, T_world_target: Float[Array, "4 4"], scene: Superquadrics) -> Bool[Array, " n"]:
+    """Which objects stand on a target at a pose; see `footprints.supports`.
+
+    An approximation: to what stands on it, a target of several pieces is the box around it, and so are objects.
+    """
+    target = body_at(grasps.target, T_world_target[:3, 3], T_world_target[:3, :3], jnp.array(True))
+    plain = [scene.replace(parts=None), jax.tree.map(lambda a: a[None], target.replace(parts=None))]
+    return supports(footprints(jax.tree.map(lambda *a: jnp.concatenate(a), *plain)))[-1, :-1]
 
 
 def crossing_hits(
@@ -354,6 +368,8 @@ def _ranked(
     T_world_target = grasps.standing(pose)
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
+    # Trials would take it out from under what falls on the board.
+    found = found.replace(feasible=found.feasible & ~jnp.any(carried(grasps, T_world_target, scene)))
 
     def near(clearance):
         return jnp.sum(straight_hits(tables, found, enlarged(scene, clearance), active), axis=1)
