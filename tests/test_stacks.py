@@ -1,19 +1,13 @@
 """Stacks: what carries something is not moved before it, and what is on top is an object like others."""
 
-import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax import planner
-from mechsearch_jax.actions.kinds.push import Push
-from mechsearch_jax.geometry.bodies import bodies_of
-from mechsearch_jax.geometry.footprints import footprints, overlapping, supports
+from mechsearch_jax.geometry.footprints import footprints, supports
 from mechsearch_jax.geometry.superquadric import EDGE_EXPONENT, Superquadrics, pad
 
 BOARD = 0.4045

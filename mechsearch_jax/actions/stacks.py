@@ -29,10 +29,10 @@ class Stacks(NamedTuple):
 def stacks(space: ActionSpace, prints: Footprints) -> Stacks:
     """The stacks of a scene, from the footprints of its objects."""
     carries = supports(prints) & (not space.config.as_in_paper)
-    return Stacks(carries, prints.valid & (jnp.any(carries, axis=0) | (lift(space, prints) > 0.0)))
+    return Stacks(carries, prints.valid & (jnp.any(carries, axis=0) | (lift(space, prints.low) > 0.0)))
 
 
-def lift(space: ActionSpace, prints: Footprints) -> Float[Array, " n"]:
-    """How far above the board the lowest point of each object is [m]; 0 within `STACKED`, and as in the paper."""
-    above = prints.low - space.shelf.board
+def lift(space: ActionSpace, lowest: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """How far above the board objects with these lowest points are [m]; 0 within `STACKED`, and as in the paper."""
+    above = lowest - space.shelf.board
     return jnp.where((above > STACKED) & (not space.config.as_in_paper), above, 0.0)

@@ -135,40 +135,30 @@ def dot(a, b):
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 
 
-def norm(v: Array) -> Array:
-    """Length of planar vectors; 0, with a gradient of 0, where they vanish."""
-    square = dot(v, v)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+def _overlapping(prints: Footprints) -> Bool[Array, "n n"]:
+    """Which footprints, without parts, overlap by more than `TOUCH`, whatever their heights.
 
-
-def reach(prints: Footprints, direction: Float[Array, "*other n 2"]) -> Float[Array, "*other n"]:
-    """How far footprints (N) reach from their centres along planar unit vectors [m]."""
-    lead = (1,) * (direction.ndim - 2)
-    yaw, half = prints.yaw.reshape(*lead, -1), prints.half.reshape(*lead, -1, 2)
-    along = dot(direction, jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1))
-    across = dot(direction, jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1))
-    parts = jnp.abs(jnp.stack([along, across], axis=-1)) * half
-    return jnp.where(prints.round.reshape(*lead, -1), norm(parts), parts[..., 0] + parts[..., 1])
-
-
-def overlapping(prints: Footprints) -> Bool[Array, "n n"]:
-    """Which footprints overlap by more than `TOUCH`, whatever their heights; for bodies of several parts the bounding
-    ones.
-
-    An approximation: ellipses that overlap by a little less with the corner of a rectangle count, too.
+    Along the axes of both and the line between their centres. An approximation: an ellipse that passes the corner of a
+    rectangle within about a centimetre may count, too.
     """
-    n, offset = prints.yaw.shape[0], prints.position[None] - prints.position[:, None]
-    apart = norm(offset)[..., None]
-    # Where both centres are the same, any direction tells as much.
-    between = jnp.where(apart > 1e-6, offset / jnp.maximum(apart, 1e-6), jnp.eye(1, 2)[None])
-    first = jnp.stack([jnp.cos(prints.yaw), jnp.sin(prints.yaw)], axis=-1)
-    axes = jnp.stack([first, turned(jnp.full(n, QUARTER_TURN), first)])[:, None]
-    axes = jnp.broadcast_to(axes, (2, n, n, 2))
-    # Along the line between both centres, the axes of the second, and those of the first.
-    normals = jnp.concatenate([between[None], axes, jnp.swapaxes(axes, 1, 2)])
-    of_first = jnp.swapaxes(reach(prints, jnp.swapaxes(normals, 1, 2)), 1, 2)
-    common = of_first + reach(prints, normals) - jnp.abs(dot(normals, offset[None]))
-    return jnp.min(common, axis=0) > TOUCH
+    n, c, s = prints.yaw.shape[0], jnp.cos(prints.yaw), jnp.sin(prints.yaw)
+    axes = jnp.stack([c, s, -s, c], axis=-1).reshape(n, 2, 2)
+    arms = axes * prints.half[..., None]
+    offset = prints.position[None] - prints.position[:, None]
+    apart = jnp.sqrt(jnp.maximum(dot(offset, offset), 1e-12))[..., None]
+    of_first = jnp.broadcast_to(axes[:, None], (n, n, 2, 2))
+    normals = jnp.concatenate([(offset / apart)[:, :, None], of_first, jnp.swapaxes(of_first, 0, 1)], axis=2)
+
+    def reach(arms: Float[Array, "*#pairs 2 2"], is_round: Bool[Array, "*#pairs"]) -> Float[Array, "n n k"]:
+        along = jnp.abs(jnp.sum(normals[..., None, :] * arms[:, :, None], axis=-1))
+        ellipse = jnp.sqrt(jnp.maximum(jnp.sum(along**2, axis=-1), 1e-12))
+        return jnp.where(is_round[..., None], ellipse, jnp.sum(along, axis=-1))
+
+    both = reach(arms[:, None], prints.round[:, None]) + reach(arms[None], prints.round[None])
+    common = both - jnp.abs(jnp.sum(normals * offset[:, :, None], axis=-1))
+    # Between equal centres there is no line.
+    common = jnp.minimum(jnp.where(apart[..., 0] > 1e-4, common[..., 0], jnp.inf), jnp.min(common[..., 1:], axis=-1))
+    return common > TOUCH
 
 
 def supports(prints: Footprints) -> Bool[Array, "n n"]:
@@ -181,7 +171,7 @@ def supports(prints: Footprints) -> Bool[Array, "n n"]:
     shapes, parts = in_world(prints), 1 if prints.parts is None else prints.parts.valid.shape[1]
     foot = jnp.repeat(prints.low, parts) if parts > 1 else prints.low
     stands = shapes.valid & (shapes.low < foot + STACKED)
-    carries = shapes.valid[:, None] & stands[None] & overlapping(shapes)
+    carries = shapes.valid[:, None] & stands[None] & _overlapping(shapes)
     carries &= jnp.abs(foot[None] - shapes.high[:, None]) < STACKED
     carries &= foot[None] > 0.5 * (foot + shapes.high)[:, None]
     return jnp.any(carries.reshape(-1, parts, prints.valid.shape[0], parts), axis=(1, 3)) if parts > 1 else carries

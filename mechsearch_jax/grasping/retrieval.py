@@ -210,8 +210,7 @@ def found_hits(
     previous: Bool[Array, "f n"] | None = None,
     moved: Bool[Array, " n"] | None = None,
 ) -> Bool[Array, "f n"]:
-    """Which objects each grasp of a found target hits on its whole way, and what the target carries; grasps that are
-    not feasible hit none.
+    """Which objects each grasp of a found target hits on its whole way; grasps that are not feasible hit none.
 
     Args:
       grasps: the grasps, as in `found_grasps`.
@@ -228,23 +227,12 @@ def found_hits(
     hits = straight_hits(grasps.tables, found, fresh, here)
     feasible = found.feasible & here
     hits |= crossing_hits(grasps.tables, grasps.gripper, fresh, found.T_world_target, feasible)
-    hits |= feasible[:, None] & carried(grasps, found.T_world_target, fresh)[None]
 
     def touches(_, scene, q):
         return jnp.any(arm_hits(q, scene), axis=0)
 
     hits |= masked_vmap(touches, feasible & jnp.any(fresh.valid), None, fresh, found.q, block=16)
     return hits if previous is None or moved is None else jnp.where(moved[None], hits, previous)
-
-
-def carried(grasps: TargetGrasps, T_world_target: Float[Array, "4 4"], scene: Superquadrics) -> Bool[Array, " n"]:
-    """Which objects stand on a target at a pose; see `footprints.supports`.
-
-    An approximation: to what stands on it, a target of several pieces is the box around it, and so are objects.
-    """
-    target = body_at(grasps.target, T_world_target[:3, 3], T_world_target[:3, :3], jnp.array(True))
-    plain = [scene.replace(parts=None), jax.tree.map(lambda a: a[None], target.replace(parts=None))]
-    return supports(footprints(jax.tree.map(lambda *a: jnp.concatenate(a), *plain)))[-1, :-1]
 
 
 def crossing_hits(
@@ -369,7 +357,7 @@ def _ranked(
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
     # Trials would take it out from under what falls on the board.
-    found = found.replace(feasible=found.feasible & ~jnp.any(carried(grasps, T_world_target, scene)))
+    found = found.replace(feasible=found.feasible & ~jnp.any(_carried(grasps, T_world_target, scene)))
 
     def near(clearance):
         return jnp.sum(straight_hits(tables, found, enlarged(scene, clearance), active), axis=1)
@@ -386,6 +374,16 @@ def _ranked(
     if space is not None:
         order += 100 * _sweep_unmeasured(tables, T_world_gripper, space, found.feasible)
     return _Ranked(T_world_gripper, found.feasible, hits, order)
+
+
+def _carried(grasps: TargetGrasps, T_world_target: Float[Array, "4 4"], scene: Superquadrics) -> Bool[Array, " n"]:
+    """Which objects stand on a target at a pose; see `footprints.supports`.
+
+    An approximation: to what stands on it, a target of several pieces is the box around it, and so are objects.
+    """
+    target = body_at(grasps.target, T_world_target[:3, 3], T_world_target[:3, :3], jnp.array(True))
+    plain = [scene.replace(parts=None), jax.tree.map(lambda a: a[None], target.replace(parts=None))]
+    return supports(footprints(jax.tree.map(lambda *a: jnp.concatenate(a), *plain)))[-1, :-1]
 
 
 def _sweep_unmeasured(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.geometry.footprints import TOUCH, Footprints, norm, reach, turned
+from mechsearch_jax.geometry.footprints import TOUCH, Footprints, turned
 from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Number of directions over half a turn in which an object's extents are features; even.
@@ -33,10 +33,26 @@ def perpendicular(v: Array) -> Array:
     return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
+def norm(v: Array) -> Array:
+    """Length of planar vectors; 0, with a gradient of 0, where they vanish."""
+    square = dot(v, v)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
 def fan(axis: Array) -> Array:
     """Unit vectors in `DIRECTIONS` directions over half a turn, beginning with that of a planar vector, (K, 2)."""
     angles = jnp.arctan2(axis[1], axis[0]) + jnp.asarray(np.arange(DIRECTIONS) * np.pi / DIRECTIONS, jnp.float32)
     return jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+
+
+def reach(prints: Footprints, direction: Float[Array, "*other n 2"]) -> Float[Array, "*other n"]:
+    """How far footprints (N) reach from their centres along planar unit vectors [m]."""
+    lead = (1,) * (direction.ndim - 2)
+    yaw, half = prints.yaw.reshape(*lead, -1), prints.half.reshape(*lead, -1, 2)
+    along = dot(direction, jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1))
+    across = dot(direction, jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1))
+    parts = jnp.abs(jnp.stack([along, across], axis=-1)) * half
+    return jnp.where(prints.round.reshape(*lead, -1), norm(parts), parts[..., 0] + parts[..., 1])
 
 
 def _slabs(width: Array, offset: Array, speed: Array) -> tuple[Array, Array]:

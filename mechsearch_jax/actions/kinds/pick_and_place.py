@@ -83,7 +83,7 @@ class PickAndPlace(SampledKind):
             space.config.grasps,
             space.max_yaw,
             space.wrists,
-            lift(space, prints),
+            lift(space, prints.low),
         )
         return T, plausible.astype(jnp.float32)
 
