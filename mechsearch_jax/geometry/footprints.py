@@ -195,6 +195,15 @@ def extents(scene: Superquadrics, directions: Float[Array, "*#n 3 d"]) -> Float[
     return jnp.where((scene.exponents[:, 1] > ROUND_EXPONENT)[:, None], plane, x + y) + z
 
 
+def lowest_points(scene: Superquadrics) -> Float[Array, " n"]:
+    """Heights of the objects' lowest points [m], as of `footprints`."""
+    shapes = world_parts(scene)
+    z = shapes.position[:, 2] - extents(shapes, jnp.array([[0.0], [0.0], [1.0]]))[:, 0]
+    if scene.parts is None:
+        return z
+    return jnp.min(jnp.where(shapes.valid, z, jnp.inf).reshape(scene.capacity, -1), axis=1)
+
+
 def bounding_half_extents(scene: Superquadrics) -> Float[Array, "n 3"]:
     """Half-extents of the objects' bounding boxes along the world's axes [m]; see `extents`."""
     return extents(scene, jnp.eye(3))

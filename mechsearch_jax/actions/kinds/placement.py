@@ -24,6 +24,7 @@ from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
 from mechsearch_jax.dynamics.rigid import held_pose, in_hand
 from mechsearch_jax.geometry.bodies import enlarged, surface_of
 from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.footprints import lowest_points
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform, translate, yaw_rotation
@@ -121,11 +122,10 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     approach = jnp.arctan2(T_grasp[1, 2], T_grasp[0, 2])
     turn = jnp.clip(turn, -space.max_yaw - approach, space.max_yaw - approach)
 
-    position = jnp.stack([x, y, jnp.full(tries, scene.position[index, 2])], axis=-1)
+    z = (scene.position[:, 2] - lift(space, lowest_points(scene)))[index]
+    position = jnp.stack([x, y, jnp.full(tries, z)], axis=-1)
     rotation = matmul(yaw_rotation(turn), in_hand(scene, index, T_grasp))
     points = transform(make(rotation, position)[:, None], cloud[None])
-    down = lift(space, jnp.min(points[..., 2], axis=1))[:, None] * jnp.array([[0.0, 0.0, 1.0]])
-    position, points = position - down, points - down[:, None]
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
     on_board &= jnp.min(points[..., 0], axis=1) > shelf.front + config.clearance
     obstacles = scene.valid & (jnp.arange(scene.capacity) != index) & grasp.wanted
