@@ -58,6 +58,7 @@ GROUPS = {
         "test_search",
         "test_envs_live",
         "test_planner_moved_target",
+        "test_stacks",
         "test_dynamics_actions",
         "test_envs_episode",
         "test_envs_batch_episode",

@@ -15,11 +15,12 @@ from mechsearch_jax.actions.approach import cloud_index, gripper_clouds
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.kind import SampledKind
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
+from mechsearch_jax.actions.stacks import stacks
 from mechsearch_jax.actions.types import Candidates, DrawnCandidate, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, touch_probability
 from mechsearch_jax.geometry.bodies import part_at, surface_of, world_parts
 from mechsearch_jax.geometry.collision import Clouds, collisions
-from mechsearch_jax.geometry.footprints import footprints
+from mechsearch_jax.geometry.footprints import Footprints, footprints
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 from mechsearch_jax.robot.entry import WaysIn, gripper_enters
@@ -57,6 +58,8 @@ def all_candidates(
     """Propose and test all candidate actions for all objects.
 
     Approaches of all kinds are tested in one batch: those of the first kind to all objects, then those of the next.
+    Every action on an object counts as hitting what the object carries, and what does not stand on the board is not
+    pushed.
 
     Args:
       space: what all actions share.
@@ -72,7 +75,9 @@ def all_candidates(
     fresh = scene.valid if moved is None else moved & scene.valid
     concerns = fresh[:, None] | fresh[None, :]
     tested_pairs = concerns & scene.valid[:, None] & scene.valid[None, :]
-    proposed = _proposed(space, scene, previous, fresh)
+    prints = footprints(scene)
+    carries, aloft = stacks(space, prints)
+    proposed = _proposed(space, scene, prints, aloft, previous, fresh)
     T_world_gripper, _, cloud = proposed.approaches
     clouds = gripper_clouds(space.tables)
     near = gripper_enters(
@@ -99,6 +104,7 @@ def all_candidates(
         hits = by_hand[part]
         hits |= kind.swept_hits(space, scene, T_world_gripper[part], mask[part] & ~hits)
         hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
+        hits |= carries[:, None]
         candidates = Candidates(T, weight, reached[i], hits, before.enters)
         usable = candidates.replace(reached=reached[i] & able[i][:, None, None])
         tested.append(candidates.replace(enters=kind.entering(space, scene, possible, usable)))
@@ -148,13 +154,21 @@ class _Proposed(NamedTuple):
     wanted: Bool[Array, " k"]
 
 
-def _proposed(space: ActionSpace, scene: Superquadrics, previous: AllCandidates, fresh: Bool[Array, " n"]) -> _Proposed:
+def _proposed(
+    space: ActionSpace,
+    scene: Superquadrics,
+    prints: Footprints,
+    aloft: Bool[Array, " n"],
+    previous: AllCandidates,
+    fresh: Bool[Array, " n"],
+) -> _Proposed:
     """Propose candidates for the fresh objects; the other objects keep their previous ones."""
-    n, prints = scene.capacity, footprints(scene)
+    n = scene.capacity
     poses, weights, wanted, wrists, openings, parts = [], [], [], [], [], []
     first = 0
     for kind, before in zip(SAMPLED_KINDS, previous, strict=True):
         T, weight = kind.propose(space, scene, prints, fresh)
+        weight = weight if kind.holds_object else jnp.where(aloft[:, None], 0.0, weight)
         poses.append(jnp.where(fresh[:, None, None, None], T, before.T_world_gripper))
         weights.append(jnp.where(fresh[:, None], weight, before.weight))
         wanted.append(((weight > 0.0) & (kind.name in space.config.actions) & fresh[:, None]).reshape(-1))

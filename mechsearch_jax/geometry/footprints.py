@@ -20,6 +20,8 @@ Numbers = Array | np.ndarray
 
 # Gap below which things count as touching [m].
 TOUCH = 0.004
+# What stands on something may be recognised so far above or below its top [m].
+STACKED = 0.01
 
 
 class Footprints(PyTreeNode):
@@ -133,6 +135,48 @@ def dot(a, b):
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 
 
+def _overlapping(prints: Footprints) -> Bool[Array, "n n"]:
+    """Which footprints, without parts, overlap by more than `TOUCH`, whatever their heights.
+
+    Along the axes of both and the line between their centres. An approximation: an ellipse that passes the corner of a
+    rectangle within about a centimetre may count, too.
+    """
+    n, c, s = prints.yaw.shape[0], jnp.cos(prints.yaw), jnp.sin(prints.yaw)
+    axes = jnp.stack([c, s, -s, c], axis=-1).reshape(n, 2, 2)
+    arms = axes * prints.half[..., None]
+    offset = prints.position[None] - prints.position[:, None]
+    apart = jnp.sqrt(jnp.maximum(dot(offset, offset), 1e-12))[..., None]
+    of_first = jnp.broadcast_to(axes[:, None], (n, n, 2, 2))
+    normals = jnp.concatenate([(offset / apart)[:, :, None], of_first, jnp.swapaxes(of_first, 0, 1)], axis=2)
+
+    def reach(arms: Float[Array, "*#pairs 2 2"], is_round: Bool[Array, "*#pairs"]) -> Float[Array, "n n k"]:
+        along = jnp.abs(jnp.sum(normals[..., None, :] * arms[:, :, None], axis=-1))
+        ellipse = jnp.sqrt(jnp.maximum(jnp.sum(along**2, axis=-1), 1e-12))
+        return jnp.where(is_round[..., None], ellipse, jnp.sum(along, axis=-1))
+
+    both = reach(arms[:, None], prints.round[:, None]) + reach(arms[None], prints.round[None])
+    common = both - jnp.abs(jnp.sum(normals * offset[:, :, None], axis=-1))
+    # Between equal centres there is no line.
+    common = jnp.minimum(jnp.where(apart[..., 0] > 1e-4, common[..., 0], jnp.inf), jnp.min(common[..., 1:], axis=-1))
+    return common > TOUCH
+
+
+def supports(prints: Footprints) -> Bool[Array, "n n"]:
+    """Which object (row) carries which (column).
+
+    The lowest point of what is carried is within `STACKED` of a top, and above the middle of what has it; from above
+    both overlap. Bodies of several parts carry with any part, and stand on those that reach down to their lowest point.
+    Nothing whose lowest point is on the board is carried, however it leans.
+    """
+    shapes, parts = in_world(prints), 1 if prints.parts is None else prints.parts.valid.shape[1]
+    foot = jnp.repeat(prints.low, parts) if parts > 1 else prints.low
+    stands = shapes.valid & (shapes.low < foot + STACKED)
+    carries = shapes.valid[:, None] & stands[None] & _overlapping(shapes)
+    carries &= jnp.abs(foot[None] - shapes.high[:, None]) < STACKED
+    carries &= foot[None] > 0.5 * (foot + shapes.high)[:, None]
+    return jnp.any(carries.reshape(-1, parts, prints.valid.shape[0], parts), axis=(1, 3)) if parts > 1 else carries
+
+
 def extents(scene: Superquadrics, directions: Float[Array, "*#n 3 d"]) -> Float[Array, "n d"]:
     """How far objects reach from their centres along directions [m].
 
@@ -149,6 +193,15 @@ def extents(scene: Superquadrics, directions: Float[Array, "*#n 3 d"]) -> Float[
     square = x**2 + y**2
     plane = jnp.sqrt(jnp.where(square > 0, square, 1.0)) * (square > 0)
     return jnp.where((scene.exponents[:, 1] > ROUND_EXPONENT)[:, None], plane, x + y) + z
+
+
+def lowest_points(scene: Superquadrics) -> Float[Array, " n"]:
+    """Heights of the objects' lowest points [m], as of `footprints`."""
+    shapes = world_parts(scene)
+    z = shapes.position[:, 2] - extents(shapes, jnp.array([[0.0], [0.0], [1.0]]))[:, 0]
+    if scene.parts is None:
+        return z
+    return jnp.min(jnp.where(shapes.valid, z, jnp.inf).reshape(scene.capacity, -1), axis=1)
 
 
 def bounding_half_extents(scene: Superquadrics) -> Float[Array, "n 3"]:

@@ -25,6 +25,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters_unmeasured
 from mechsearch_jax.geometry.bodies import enlarged, slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.footprints import footprints, supports
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, transform, upright_pose
@@ -38,6 +39,7 @@ from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import body_at
 
 # Largest number of grasps that are tried.
 TRIES = 8
@@ -354,6 +356,8 @@ def _ranked(
     T_world_target = grasps.standing(pose)
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
+    # Trials would take it out from under what falls on the board.
+    found = found.replace(feasible=found.feasible & ~jnp.any(_carried(grasps, T_world_target, scene)))
 
     def near(clearance):
         return jnp.sum(straight_hits(tables, found, enlarged(scene, clearance), active), axis=1)
@@ -370,6 +374,16 @@ def _ranked(
     if space is not None:
         order += 100 * _sweep_unmeasured(tables, T_world_gripper, space, found.feasible)
     return _Ranked(T_world_gripper, found.feasible, hits, order)
+
+
+def _carried(grasps: TargetGrasps, T_world_target: Float[Array, "4 4"], scene: Superquadrics) -> Bool[Array, " n"]:
+    """Which objects stand on a target at a pose; see `footprints.supports`.
+
+    An approximation: to what stands on it, a target of several pieces is the box around it, and so are objects.
+    """
+    target = body_at(grasps.target, T_world_target[:3, 3], T_world_target[:3, :3], jnp.array(True))
+    plain = [scene.replace(parts=None), jax.tree.map(lambda a: a[None], target.replace(parts=None))]
+    return supports(footprints(jax.tree.map(lambda *a: jnp.concatenate(a), *plain)))[-1, :-1]
 
 
 def _sweep_unmeasured(

@@ -114,8 +114,9 @@ def object_grasps(
     config: ObjectGraspConfig,
     max_yaw: float,
     wrists: int,
+    above: Float[Array, " n"] | None = None,
 ) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
-    """Side grasps of objects that stand or lie on the board.
+    """Side grasps of objects that stand or lie on the board or on each other.
 
     Round objects are grasped through their axis from directions spread over `max_yaw`, others by `config.boxes`. A body
     of several parts is grasped by those that fit between the fingers, in turns.
@@ -127,12 +128,14 @@ def object_grasps(
       config: static.
       max_yaw: largest angle between the approach to a round object and +x [rad]; for flat sides see `config`.
       wrists: number of angles of joint 7.
+      above: how far above the board each stands [m]; None for on it.
 
     Returns:
       Gripper poses in the world, in the order of `grasp_variants`, and whether the object fits between the fingers.
     """
     if prints.parts is not None:
-        of_parts = object_grasps(shelf, gripper, in_world(prints), config, max_yaw, wrists)
+        above = None if above is None else jnp.repeat(above, prints.parts.valid.shape[1])
+        of_parts = object_grasps(shelf, gripper, in_world(prints), config, max_yaw, wrists, above)
         return _by_turns(prints, *of_parts, grasp_variants(config, wrists)[0])
     box, _, tilt = grasp_variants(config, wrists)
     n, a, count = prints.yaw.shape[0], len(box), len(config.boxes)
@@ -156,7 +159,8 @@ def object_grasps(
 
     round_drop = np.asarray(config.round_drops, np.float32)[box % len(config.round_drops)]
     drop = jnp.where(is_round, round_drop[None], box_drop[None])
-    z = jnp.maximum(prints.high[:, None] - drop, shelf.board + LOWEST)
+    lowest = shelf.board + LOWEST + (0.0 if above is None else above[:, None])
+    z = jnp.maximum(prints.high[:, None] - drop, lowest)
     # The palm must not hit the object: its front, or its top edge if the palm reaches that high.
     c, t = np.cos(tilt), np.tan(tilt)
     above = jnp.clip(prints.high[:, None] - z, 0.0, jnp.float32(PALM * np.sin(tilt) + PALM * c)[None])

@@ -22,6 +22,7 @@ from mechsearch_jax.actions.config import OPEN, ActionSpace
 from mechsearch_jax.actions.kind import SampledKind, Sketch
 from mechsearch_jax.actions.kinds.object_grasps import grasp_variants, object_grasps
 from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
+from mechsearch_jax.actions.stacks import lift
 from mechsearch_jax.actions.types import Action, Candidates, DrawnCandidate, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.rigid import held_pose, pick_and_place
@@ -76,7 +77,13 @@ class PickAndPlace(SampledKind):
     def propose(self, space, scene, prints, fresh):
         """See `object_grasps`."""
         T, plausible = object_grasps(
-            space.shelf, space.gripper, prints, space.config.grasps, space.max_yaw, space.wrists
+            space.shelf,
+            space.gripper,
+            prints,
+            space.config.grasps,
+            space.max_yaw,
+            space.wrists,
+            lift(space, prints.low),
         )
         return T, plausible.astype(jnp.float32)
 

@@ -19,10 +19,12 @@ from mechsearch_jax.actions.approach import (
     swept_places,
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace
+from mechsearch_jax.actions.stacks import lift
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
 from mechsearch_jax.dynamics.rigid import held_pose, in_hand
 from mechsearch_jax.geometry.bodies import enlarged, surface_of
 from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.footprints import lowest_points
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform, translate, yaw_rotation
@@ -107,6 +109,7 @@ def placement(
 def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, cloud, grasp: ObjectGrasp):
     """Random places for a picked object, most promising first: (position, rotation, turn, whether it can stand there).
 
+    All are on the board, wherever the object stands now.
     Places that overlap other objects or the shelf come last, before these the places in possible space, and before
     these, for a body of several parts, those at the front edge. `order` is below 1, so that each rule outweighs it.
     """
@@ -119,7 +122,8 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     approach = jnp.arctan2(T_grasp[1, 2], T_grasp[0, 2])
     turn = jnp.clip(turn, -space.max_yaw - approach, space.max_yaw - approach)
 
-    position = jnp.stack([x, y, jnp.full(tries, scene.position[index, 2])], axis=-1)
+    z = (scene.position[:, 2] - lift(space, lowest_points(scene)))[index]
+    position = jnp.stack([x, y, jnp.full(tries, z)], axis=-1)
     rotation = matmul(yaw_rotation(turn), in_hand(scene, index, T_grasp))
     points = transform(make(rotation, position)[:, None], cloud[None])
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)

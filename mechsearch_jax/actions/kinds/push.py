@@ -24,12 +24,13 @@ from mechsearch_jax.actions.approach import (
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace
 from mechsearch_jax.actions.kind import SampledKind, Sketch
 from mechsearch_jax.actions.kinds.object_grasps import PASSING_GAP
+from mechsearch_jax.actions.stacks import stacks
 from mechsearch_jax.actions.types import Action, Candidates, DrawnCandidate, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT, PushModel
 from mechsearch_jax.geometry.bodies import slimmed
 from mechsearch_jax.geometry.collision import collisions
-from mechsearch_jax.geometry.footprints import TOUCH, Footprints, extents, turned
+from mechsearch_jax.geometry.footprints import TOUCH, Footprints, extents, footprints, turned
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
@@ -430,16 +431,27 @@ class Push(SampledKind):
         """The prediction of the push model, and whether the push is possible.
 
         It is impossible if the arm cannot follow, or if the push jams, tips an object, moves an untouchable one, pushes
-        one to an edge without a wall, or makes the gripper hit one that stays; or if the prediction is not finite.
+        one to the front edge, or makes the gripper hit one that stays; or if the prediction is not finite.
+
+        Nothing of a stack is touched: push models predict what slides on the board, and are not shown what stands on
+        something. What is moved must not end within its circle around what stands on something, as seen from above.
         """
         pushes = action.kind == CODE
         # A push model that simulates has less to do where nothing is pushed.
         displacement = jnp.where(pushes, action.displacement, 0.0)
-        pushed = push_model(space.shelf, scene, space.tables.pusher, action.T_world_gripper, displacement, action.q7)
+        prints = footprints(scene)
+        carries, aloft = stacks(space, prints)
+        standing = scene.replace(valid=scene.valid & ~aloft)
+        pushed = push_model(space.shelf, standing, space.tables.pusher, action.T_world_gripper, displacement, action.q7)
+        pushed = pushed.replace(scene=pushed.scene.replace(valid=scene.valid))
         moved = pushed.moved
         config = space.config
         allowed = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
-        spoiled = ~allowed | jnp.any(moved & untouchable)
+        spoiled = ~allowed | jnp.any(moved & (untouchable | jnp.any(carries, axis=1)))
+        radius = jnp.sqrt(jnp.sum(prints.half**2, axis=1))
+        apart = jnp.sum((pushed.scene.position[:, None, :2] - prints.position[None]) ** 2, axis=-1)
+        near = apart < (radius[:, None] + radius[None]) ** 2
+        spoiled |= jnp.any(moved[:, None] & aloft[None] & near)
         x, y, _ = pushed.scene.position.T
         spoiled |= jnp.any(moved & ((x < space.shelf.front + EDGE) | past_open_side(space.shelf, x, y, EDGE)))
         spoiled |= gripper_meets(space, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
