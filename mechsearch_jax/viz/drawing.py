@@ -158,11 +158,12 @@ def draw_shelf(axes: Axes, shelf: Shelf) -> None:
     )
     corners = ((left, front), (left, back), (right, back), (right, front), (left, front))
     # As few strokes as there are styles, so that walls join at corners.
-    for is_wall, style in ((True, {"linewidth": 3.5}), (False, {"linewidth": 1, "linestyle": (0, (4, 3))})):
+    for is_wall, width, dashes in ((True, 3.5, "-"), (False, 1.0, (0, (4, 3)))):
         line = list[tuple[float, float]]()
         for face, ends in zip(("left", "back", "right", "front"), itertools.pairwise(corners), strict=True):
             line += ends if (face in shelf.faces) == is_wall else [(math.nan, math.nan)]
-        axes.plot(*zip(*line, strict=True), color=WALL, solid_joinstyle="miter", **style)
+        across, along = np.transpose(line)
+        axes.plot(across, along, color=WALL, solid_joinstyle="miter", linewidth=width, linestyle=dashes)
     axes.text(
         left - 0.01, front - 0.75 * ROBOT_STRIP, "robot's side", color=MUTED, fontsize=LETTER, ha="left", va="center"
     )
