@@ -31,7 +31,7 @@ from mechsearch_jax.networks.recognition import (
     apply_network,
 )
 from mechsearch_jax.networks.weights import save_weights
-from mechsearch_jax.perception.recognition import best_hypothesis
+from mechsearch_jax.perception.recognition import best_hypothesis, nearness
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
 from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.shapes import by_shape
@@ -39,13 +39,14 @@ from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
     PIXELS,
     Capture,
+    Scene,
     SceneConfig,
-    capture,
     in_catalogue,
     noise_names,
     origin,
-    random_world,
+    random_scene,
     surface_points,
+    taken,
     visible_share,
     worth_seeing,
 )
@@ -57,6 +58,8 @@ SURFACE = 512
 _UNIT = 0.01
 # How far beyond its range of yaw angles a hypothesis is still trained [rad].
 _OVERLAP = np.deg2rad(6.0)
+# Deviation of the height of what an object stands on, where that is no board [m].
+_SUPPORT_ERROR = 0.002
 # Exponents of a sharp edge, and of a round cross-section.
 _SHARP, _ROUND = 0.06, 1.0
 
@@ -175,6 +178,7 @@ class RecognitionTask:
       view: which rays are cast.
       share: mean number of examples per scene, of its up to eight objects.
       ragged: share of scenes whose labels have ragged borders, as a segmentation's.
+      misjudged: share of objects that are taken to stand on what another object stands on, in scenes with stacks.
       precision: type in which the network computes.
     """
 
@@ -185,6 +189,7 @@ class RecognitionTask:
     view: View = dataclasses.field(default_factory=shelf_view)
     share: int = 5
     ragged: float = 0.25
+    misjudged: float = 0.15
     precision: Any = jnp.bfloat16
     name: str = "recognition"
 
@@ -200,10 +205,14 @@ class RecognitionTask:
     def scene(self, key: Key[Array, ""]) -> tuple[World, Capture, Example]:
         """A random scene, its image, and the examples of its eight slots."""
         worlds, sensing, drawing, surfaces, tearing, torn = jax.random.split(key, 6)
-        world = random_world(worlds, self.scenes, self.shelf)
-        seen = capture(sensing, world, self.scenes, self.shelf, self.view)
+        scene, seen = taken(sensing, random_scene(worlds, self.scenes, self.shelf, self.view), self.scenes)
+        world = scene.world
         labels = jnp.where(jax.random.bernoulli(torn, self.ragged), tear(tearing, seen.labels), seen.labels)
-        segments = segment_clouds(drawing, self.view.camera, seen.points, labels, self.shelf, TARGET, self.segments)
+        segments = segment_clouds(drawing, scene.camera, seen.points, labels, scene.shelf, TARGET, self.segments)
+        if self.scenes.stacked:
+            segments = self._raised(jax.random.fold_in(drawing, 1), segments, scene)
+        if self.scenes.places is not None:
+            segments = segments.replace(camera=nearness(scene.camera, scene.shelf) * segments.camera)
         objects = jax.tree.map(lambda a: a[:TARGET], world)
         local = jax.vmap(functools.partial(surface_points, count=SURFACE))(
             jax.random.split(surfaces, TARGET), objects.kind, objects.half_size
@@ -221,6 +230,19 @@ class RecognitionTask:
         # Training includes objects that show too little to be scored, but at least a quarter of that.
         taught = segments.valid & objects.valid & worth_seeing(seen, self.view, PIXELS // 4)
         return world, seen, Example(segments, truth, taught.astype(jnp.float32))
+
+    def _raised(self, key: Array, segments: Segments, scene: Scene) -> Segments:
+        """The segments as if the board were what each stands on, with some mistakes."""
+        wrong, other, error = jax.random.split(key, 3)
+        support = scene.support[:TARGET] - scene.shelf.board
+        support = jnp.where(support > 0, support + _SUPPORT_ERROR * jax.random.normal(error, (TARGET,)), 0.0)
+        misjudged = jax.random.bernoulli(wrong, self.misjudged, (TARGET,))
+        support = jnp.where(misjudged, support[jax.random.randint(other, (TARGET,), 0, TARGET)], support)
+        return segments.replace(
+            points=segments.points.at[..., 2].add(-support[:, None]),
+            camera=segments.camera.at[..., 2].add(-support),
+            T_world_segment=segments.T_world_segment.at[:, 2, 3].add(support),
+        )
 
     def sample(self, key: Key[Array, ""], batch: int) -> Example:
         examples = jax.vmap(lambda k: self.scene(k)[2])(jax.random.split(key, batch))

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.world.world import TARGET
+from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.images.cloud import POINTS, View, cloud_of, resample, shelf_view
 from mechsearch_jax.images.labels import INSTANCES, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
@@ -23,7 +23,7 @@ from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
 from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
+from mechsearch_jax.train.scenes import SceneConfig, noise_names, origin, random_scene, taken, worth_seeing
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Weight of a layer's loss relative to the next layer's.
@@ -127,18 +127,19 @@ class SegmentationTask:
     def scene(self, key: Key[Array, ""]) -> Example:
         """A random scene's cloud.
 
-        The target's points are left out, as by the detector's mask. Points of the shelf that noise has lifted off it
-        are kept as OTHER.
+        The target's points are left out, as by the detector's mask; the last instance is a ninth object. Points of
+        further objects, and of the shelf where noise has lifted them off it, are kept as OTHER.
         """
         worlds, sensing, drawing = jax.random.split(key, 3)
-        world = random_world(worlds, self.scenes, self.shelf)
-        seen = capture(sensing, world, self.scenes, self.shelf, self.view)
+        scene, seen = taken(sensing, random_scene(worlds, self.scenes, self.shelf, self.view), self.scenes)
+        world = scene.world
         cloud = cloud_of(seen.points)
         labels = seen.labels.reshape(-1)
         cloud = cloud.replace(valid=cloud.valid & (labels >= OTHER) & (labels != TARGET))
         cloud = resample(drawing, cloud, self.points)
-        label = jnp.where(cloud.valid, labels[cloud.pixel], OTHER)
-        centres = world.position[jnp.clip(label, 0, TARGET - 1)]
+        slot = jnp.where(cloud.valid, labels[cloud.pixel], OTHER)
+        centres = world.position[jnp.maximum(slot, 0)]
+        label = jnp.where(slot < TARGET, slot, jnp.where(slot == BODIES, TARGET, OTHER)).astype(slot.dtype)
         weight = cloud.valid[0].astype(jnp.float32)
         return Example(
             points=cloud.points,

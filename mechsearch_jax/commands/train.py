@@ -61,21 +61,28 @@ def _training_of(name: Literal["segmentation", "recognition"], usual: Training) 
     """The command that trains one network of perception."""
 
     def command(
-        *, out: Path, touching: float = 0.2, training: Annotated[Training, tyro.conf.arg(name="")] = usual
+        *,
+        out: Path,
+        scenes: Literal["usual", "real"] = "usual",
+        touching: float = 0.2,
+        training: Annotated[Training, tyro.conf.arg(name="")] = usual,
     ) -> None:
         from mechsearch_jax.runtime.files import check_writable
         from mechsearch_jax.train.run import TASKS, run
         from mechsearch_jax.train.scenes import SceneConfig
 
-        config, scenes = training.config(minutes=10.0), SceneConfig(touching=touching)
+        config = training.config(minutes=10.0)
+        drawn = SceneConfig(touching=touching) if scenes == "usual" else SceneConfig.real(touching)
         check_writable(out)
-        run(TASKS[name](scenes=scenes), config, out)
+        run(TASKS[name](scenes=drawn), config, out)
 
     command.__name__ = name
     command.__doc__ = f"""Train the network of {name} on scenes made as they are needed; goes on where it was stopped.
 
     Args:
       out: folder for the checkpoint, the curves (scalars.jsonl), and in the end {name}.npz and its card {name}.json.
+      scenes: "usual" are on the default shelf before its camera; of "real" ones half are of tables and other shelves,
+        with stacks, open vessels and the sensors of `--sensor`.
       touching: share of objects that are pushed against another.
       training: how it is trained.
     """
