@@ -46,7 +46,10 @@ def drawn():
 
     @jax.jit
     def make(key):
-        scene, seen, examples = RECOGNITION.scene(key)
+        # As the task draws them.
+        drawing, sensing = jax.random.split(key, 6)[:2]
+        scene, _ = scenes.taken(sensing, scenes.random_scene(drawing, REAL, SHELF, VIEW), REAL)
+        _, seen, examples = RECOGNITION.scene(key)
         return plain(scene), seen, examples.segments.T_world_segment, examples.weight
 
     return jax.tree.map(np.asarray, jax.vmap(make)(jax.random.split(jax.random.key(0), COUNT)))

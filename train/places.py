@@ -118,8 +118,8 @@ def draw_camera(
     return Camera(
         width=usual.width,
         height=usual.height,
-        fx=focal,
-        fy=focal,
+        fx=focal,  # pyright: ignore[reportArgumentType]
+        fy=focal,  # pyright: ignore[reportArgumentType]
         cx=jnp.float32(usual.width / 2),
         cy=jnp.float32(usual.height / 2),
         rotation=tuple(tuple(row) for row in jnp.stack([right, jnp.cross(-back, right), -back], axis=1)),

@@ -35,9 +35,9 @@ def cut_round(
       half_size: radius, radius and half the height [m].
       form: of the body, without leading axes.
     """
-    square = sum(d * d for d in direction)
+    square = sum((d * d for d in direction), jnp.zeros(()))
     # From the point nearest to the centre: the difference of large squares would lose digits.
-    start = -sum(o * d for o, d in zip(origin, direction, strict=True)) / square
+    start = -sum((o * d for o, d in zip(origin, direction, strict=True)), jnp.zeros(())) / square
     x, y, z = (o + start * d for o, d in zip(origin, direction, strict=True))
     u, v, w = direction
     radius, half = half_size[0], half_size[2]
