@@ -138,7 +138,7 @@ def test_visible_share_counts_what_others_hide():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"objects": (0, 3)}, {"objects": (5, 9)}, {"known": 1.5}, {"sides": (0.0, 0.1)}, {"noises": ()}]
+    "wrong", [{"objects": (0, 3)}, {"objects": (5, 17)}, {"known": 1.5}, {"sides": (0.0, 0.1)}, {"noises": ()}]
 )
 def test_impossible_scenes_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):

@@ -124,7 +124,9 @@ def read_view(card: Mapping[str, Any], where: str) -> TrainedView | None:
         return None
     entry = _table(card["view"], ("camera", "shelf"), f"{where}: view")
     # Cards that do not name its faces are of a shelf with all of them.
-    shelf = {"faces": list(FACES)} | entry["shelf"] if isinstance(entry["shelf"], dict) else entry["shelf"]
+    shelf = entry["shelf"]
+    if isinstance(shelf, dict) and shelf:
+        shelf = {"faces": list(FACES)} | shelf
     return TrainedView(
         _record(Camera, entry["camera"], f"{where}: view: camera"),
         _record(Shelf, shelf, f"{where}: view: shelf"),
