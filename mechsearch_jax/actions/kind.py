@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 
 import jax
@@ -34,7 +35,7 @@ class Sketch:
     takes_target: bool = False
 
 
-class Kind:
+class Kind(abc.ABC):
     """A kind of action.
 
     Attributes:
@@ -53,6 +54,7 @@ class Kind:
     takes_target: bool = False
     returns_home: bool = False
 
+    @abc.abstractmethod
     def predict(
         self,
         space: ActionSpace,
@@ -72,16 +74,16 @@ class Kind:
           action: a single action.
           wrist: index of its wrist angle.
         """
-        raise NotImplementedError
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
         """The motion of arm and fingers, and whether the arm reaches all of it; None for a kind without motion."""
         return None
 
+    @abc.abstractmethod
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
         """What a picture shows of an action, from the objects before it and those predicted after it."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def describe(self, action: Action, target: int | None = None) -> str:
         """A single action in words, with directions as seen by the robot.
 
@@ -89,7 +91,6 @@ class Kind:
           action: of this kind.
           target: the object index that stands for the target; None if there is none.
         """
-        raise NotImplementedError
 
 
 class SampledKind(Kind):
@@ -107,20 +108,21 @@ class SampledKind(Kind):
     surrounds_object: bool
     moves_target: bool
 
+    @abc.abstractmethod
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
         """Index of the wrist angle of each gripper pose."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def distances(self, space: ActionSpace) -> int:
         """The number of distances D."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def propose(
         self, space: ActionSpace, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
     ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
         """Gripper poses of all candidates, and their `Candidates.weight`; only those of `fresh` objects are used."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def travels(self, space: ActionSpace, T: Float[Array, "k 4 4"], near: Bool[Array, " k"]) -> Bool[Array, "k d"]:
         """Whether arm and shelf allow the motion after the approach; K = N V gripper poses.
 
@@ -129,20 +131,20 @@ class SampledKind(Kind):
           T: gripper poses, object by object.
           near: whether the arm can approach each pose; the result is False elsewhere.
         """
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def swept_hits(
         self, space: ActionSpace, scene: Superquadrics, T: Float[Array, "k 4 4"], mask: Bool[Array, "k n"]
     ) -> Bool[Array, "k n"]:
         """Which objects the grasped object hits on its way out, where the mask is true."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def entering(
         self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates
     ) -> Bool[Array, "n v d"]:
         """Which candidates enter space where the target may be; tested only for candidates that hit nothing."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def draft(
         self,
         key: jax.Array,
@@ -153,4 +155,3 @@ class SampledKind(Kind):
         drawn: DrawnCandidate,
     ) -> tuple[Bool[Array, ""], Sample]:
         """Whether a drawn candidate can be executed, and its action; its number may be out of range if not `wanted`."""
-        raise NotImplementedError
