@@ -45,7 +45,7 @@ class Places:
     spread: tuple[float, float] = (0.35, 0.9)
     distance: tuple[float, float] = (0.4, 1.6)
     elevation: tuple[float, float] = (np.deg2rad(10.0), np.deg2rad(60.0))
-    shelf_elevation: tuple[float, float] = (np.deg2rad(10.0), np.deg2rad(28.0))
+    shelf_elevation: tuple[float, float] = (0.0, np.deg2rad(28.0))
     azimuth: float = np.deg2rad(90.0)
     shelf_azimuth: float = np.deg2rad(30.0)
     density: tuple[float, float] = (260.0, 620.0)
@@ -57,7 +57,7 @@ class Places:
                 raise InputError(f"Places: {name} {getattr(self, name)} must be ranges of positive numbers")
         for name in ("elevation", "shelf_elevation"):
             low, high = getattr(self, name)
-            if not 0 < low <= high < np.pi / 2:
+            if not 0 <= low <= high < np.pi / 2:
                 raise InputError(f"Places: {name} {getattr(self, name)} must be a range within 0 to pi / 2")
         if not (0 <= self.tables <= 1 and self.spread[1] <= 1 and min(self.azimuth, self.shelf_azimuth) >= 0):
             raise InputError("Places: tables and spread must be from 0 to 1, azimuth and shelf_azimuth at least 0")
