@@ -616,7 +616,7 @@ def in_catalogue(world: World) -> Bool[Array, " bodies"]:
 
 def noise_names(config: SceneConfig) -> list[str]:
     """Names of the sensors, as `Capture.sensor` numbers them."""
-    sensors: dict[Any, str] = {sensor: name for name, sensor in SENSORS.items()}
+    sensors: dict[Any, str] = {Sensor(): "none", **{sensor: name for name, sensor in SENSORS.items()}}
     return [sensors.get(noise) or getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
 
 

@@ -104,15 +104,23 @@ def _of_pushes(stored: Mapping[str, Any]) -> str:
 
 
 _SCENES = (
-    "Scenes are made at random while it trains, seen by the default camera into the default shelf, and ray-cast in "
-    "MuJoCo. Nothing of it is a real image. Scenes that anything is measured on come from seeds that training refuses."
+    "Scenes are made at random while it trains, and ray-cast. Half of them are tables and shelves as people have them, "
+    "with stacks, tins and open vessels, from other places; the others are seen by the default camera into the default "
+    "shelf. Both are seen through the same sensors. Nothing of it is a real image. Scenes that anything is measured on "
+    "come from seeds that training refuses."
 )
-_TOUCHING = "The second command goes on from the weights of the first, with more objects that touch each other."
-_REAL = "Nobody has tried it on images of a real camera."
+_LATER = (
+    "Each command goes on from the weights of the one before: the second with more objects that touch each other, the "
+    "third and fourth with the scenes above; the first two saw only the default shelf."
+)
+_REAL = (
+    "It has seen no real image in training. [What it makes of some](../results.md#real-images): tables before one "
+    "camera, and one shelf."
+)
 _SHAPES = "It knows boxes and cylinders; [another shape](../extend.md#a-new-object-shape) has to be trained."
 _VIEWS = (
-    "It knows one camera before one shelf. [How far others may differ](../method.md#other-cameras-and-shelves), and "
-    "what is warned of, is a table."
+    "[How far other cameras and shelves may differ](../method.md#other-cameras-and-shelves), and what is warned of, is "
+    "a table."
 )
 
 # What the settings of training data are.
@@ -129,6 +137,22 @@ MEANINGS = {
     "target": "share of scenes with a target, whose points belong to no object",
     "placements": "places that are tried for an object",
     "noises": "each scene's sensor is one of these",
+    "stacked": "share of objects that stand on another",
+    "propped": "share of leaning objects that lean against another",
+    "tapered": "share of round objects whose radius shrinks towards an end",
+    "taper": "the smaller radius, as a share of the larger",
+    "hollow": "share of round objects that are open at the top",
+    "wall": "thickness of their walls [m]",
+    "tables": "share of table tops; the others are shelves",
+    "table": "depth, width and height of a table top's space [m]",
+    "shelf": "of a shelf's [m]",
+    "spread": "share of a table top's space over which things are spread",
+    "distance": "of the camera from the middle of the objects [m]",
+    "elevation": "angle by which it looks down on a table top [rad]",
+    "shelf_elevation": "angle by which it looks down into a shelf [rad]",
+    "azimuth": "largest angle by which it stands to a side of a table top [rad]",
+    "shelf_azimuth": "largest angle by which it stands to a side of a shelf [rad]",
+    "density": "pixels of an image for a metre at that distance",
     "engine": "the simulator",
     "pushes": "drawn for training",
     "found": "that were simulated",
@@ -152,7 +176,7 @@ CARD_OF: dict[str, Card] = {
         inputs="the points of a segment and of what surrounds it, with a mark each, and where the camera is",
         outputs="several hypotheses of half-extents, exponents and pose, and how far each is expected to be off",
         data=_SCENES,
-        training=_TOUCHING,
+        training=_LATER,
         measured=(
             "`python -m mechsearch_jax.benchmarks.lab recognition`, from true masks: "
             "intersection over union of the recognised and the true "
@@ -181,7 +205,7 @@ CARD_OF: dict[str, Card] = {
         inputs="the points of the shelf's space in a depth image, in the world; no colour",
         outputs="for each point the probabilities of nine instances and of being no object",
         data=_SCENES,
-        training=_TOUCHING,
+        training=_LATER,
         measured=(
             "`python -m mechsearch_jax.benchmarks.lab segmentation`: "
             "intersection over union of the pixels of each object that shows at least "
@@ -248,8 +272,23 @@ def _told(stored: Mapping[str, Any]) -> str:
 
 def _value(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(map(_value, value)) if isinstance(value[0], str) else " to ".join(map(_value, value))
+        together = " to " if isinstance(value[0], int | float) else ", "
+        return together.join(map(_value, value))
     return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _data(data: Mapping[str, Any]) -> str:
+    """The table of the settings of training data: of a half of the scenes, and of the others."""
+    left_out = ("source", "seed", "places", "also", "share")
+    settings = {key: value for key, value in {**data, **data.get("places", {})}.items() if key not in left_out}
+    names = [key.replace("_", " ") for key in settings]
+    columns = {"setting": names, "value": map(_value, settings.values())}
+    if "also" in data:
+        usual = [data["also"].get(key) for key in settings]
+        unlike = [key != "noises" and bool(value) for key, value in zip(settings, usual, strict=True)]
+        columns["default shelf"] = [_value(value) if shown else "" for value, shown in zip(usual, unlike, strict=True)]
+    columns["what it is"] = [MEANINGS[key] for key in settings]
+    return table(list(columns), zip(*columns.values(), strict=True))
 
 
 def page(name: str, results: PathLike = RESULTS, cards: PathLike = CARDS) -> str:
@@ -269,15 +308,13 @@ def page(name: str, results: PathLike = RESULTS, cards: PathLike = CARDS) -> str
     sha = measured.get("weights", stored)["sha256"]
     if sha != stored["sha256"]:
         raise InputError(f"{file}: is of other weights ({sha[:12]}) than {name}.npz ({stored['sha256'][:12]})")
-    settings = {key: value for key, value in stored["data"].items() if key not in ("source", "seed")}
-    rows = [[key.replace("_", " "), _value(value), MEANINGS[key]] for key, value in settings.items()]
     text = _template().render(
         name=name,
         card=CARD_OF[name],
         stored=stored,
         size=f"{stored['bytes'] / 1e6:.1f} MB",
         shape=", ".join(f"{key} {value}" for key, value in stored["config"].items()),
-        data=table(["setting", "value", "what it is"], rows),
+        data=_data(stored["data"]),
         lineage=_told(stored),
         commands=[each["command"] for each in _lineage(stored)],
         figures=CARD_OF[name].figures(measured),
