@@ -274,7 +274,7 @@ def _value(value: Any) -> str:
     if isinstance(value, list):
         together = " to " if isinstance(value[0], int | float) else ", "
         return together.join(map(_value, value))
-    return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _data(data: Mapping[str, Any]) -> str:
@@ -285,7 +285,10 @@ def _data(data: Mapping[str, Any]) -> str:
     columns = {"setting": names, "value": map(_value, settings.values())}
     if "also" in data:
         usual = [data["also"].get(key) for key in settings]
-        unlike = [key != "noises" and bool(value) for key, value in zip(settings, usual, strict=True)]
+        # The sensors are the same, and round things have no other form.
+        unlike = [
+            key not in ("noises", "taper", "wall") and bool(value) for key, value in zip(settings, usual, strict=True)
+        ]
         columns["default shelf"] = [_value(value) if shown else "" for value, shown in zip(usual, unlike, strict=True)]
     columns["what it is"] = [MEANINGS[key] for key in settings]
     return table(list(columns), zip(*columns.values(), strict=True))

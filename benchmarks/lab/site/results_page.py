@@ -171,6 +171,31 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
+# Figures of `bench real` on the page; those of single kinds of scene are of the first two.
+REAL = ("matched", "matched well", "split", "phantoms", "90th percentile, mm", "rays through, %", "stand raised")
+OF_KINDS = 2
+
+
+def real_images(stored: Stored) -> str:
+    """The table of what `bench real` measures on tables, each kind of them, and a shelf."""
+
+    def cell(figures: Mapping[str, Any], name: str) -> str:
+        entry = figures.get(name, {})
+        if entry.get("value") is None:
+            return "–"
+        low, high = entry["interval"]
+        return f"{entry['value']:.2f} ({low:.2f} to {high:.2f})"
+
+    lines = []
+    for file, place in (("real-tables-cpu", "tables"), ("real-shelf-cpu", "a shelf")):
+        for images, groups in stored[file]["figures"].items():
+            for group, figures in groups.items():
+                names = REAL if group == "all" else REAL[:OF_KINDS]
+                cells = [cell(figures, name) if name in names else "" for name in REAL]
+                lines.append([place if group == "all" else f"{place}: {group}", images, *cells])
+    return table(["images", "seen from", *REAL], lines)
+
+
 def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[EpisodeRow]:
     """The rows with such settings on scenes that nothing was chosen on; a later option was as it is usually."""
     wanted = Settings(preset, differing)
@@ -248,6 +273,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),
+        "real": real_images(stored),
         "batch_decision": 1000 * sum(row.planning_seconds for row in batch.rows) / sum(row.steps for row in batch.rows),
         "at_once": planned["shapes"]["batch"] / planned["median_seconds"],
         "batch_ready": clock["all compiled [s]"],
