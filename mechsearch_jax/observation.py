@@ -19,7 +19,7 @@ class Observation(PyTreeNode):
       objects: the recognised objects, without the target, fields (..., N, ...); each may have several parts.
       target_visible: whether the target is visible, bool, shape (...).
       target_pose: x, y [m] and yaw [rad] in the world, shape (..., 3); arbitrary if it is not visible.
-      confidence: the probability that each object is where it is and as it is, to 2 cm and 15 degrees, shape (..., N);
+      confidence: the probability that each object is where it is and as it is, to 1 cm and 10 degrees, shape (..., N);
         see `perception.confidence`. 1 for true shapes, 0 for absent objects; None if nothing says how sure they are.
       measured: the share of each pixel of a coarse image that was measured, see `images.measured.measured_share`, shape
         (..., h, w); None if everything was. Where nothing was measured the target, and anything else, may be.

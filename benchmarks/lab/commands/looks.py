@@ -15,6 +15,8 @@ from mechsearch_jax.commands.options import (
 )
 from mechsearch_jax.runtime.errors import check_once
 
+# Objects of at least this confidence are counted apart.
+SURE = 0.9
 Noise = Literal["clean", "gaussian", "time-of-flight"]
 Segments = Literal["network", "explained", "joined", "true"]
 Description = Literal["one", "parts", "true parts"]
@@ -141,4 +143,47 @@ def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = 
     console.print(sensors_table(columns))
 
 
-COMMANDS = {"looks": bench_looks, "bodies": bench_bodies, "sensors": bench_sensors}
+def bench_confidence(*, scenes: int = 250) -> None:
+    """Measure how often recognised objects are right by their stated confidence, on simulated tables and shelves before
+    all sensors, and fit the constants that it is computed with to every other scene.
+
+    Args:
+      scenes: how many are looked at; those of odd numbers are judged.
+
+    Raises:
+      InputError: there is none.
+    """
+    import numpy as np
+    from rich.console import Console
+    from scipy.special import expit
+
+    from mechsearch_jax.benchmarks.lab.looks import confidences
+    from mechsearch_jax.benchmarks.report.console_tables import plain_table
+
+    at_least_one("lab confidence", scenes=scenes)
+    console = Console(highlight=False)
+    with console.status("compiling") as status:
+        rows = confidences.looked_at(scenes, lambda done: status.update(f"looking {done}/{scenes}"))
+    about, right = np.stack(rows.logarithms), rows.right.to_numpy()
+    fitted_to = (rows.scene % 2 == 0).to_numpy()
+    found = confidences.constants(about[fitted_to], right[fitted_to])
+    rows["fitted"] = expit(-(found[0] + about @ found[1:]))
+    table = plain_table(f"of the scenes that nothing is fitted to, {(~fitted_to).sum()} objects")
+    for name in ("confidence", "from", "to", "objects", "right", "stated"):
+        table.add_column(name, justify="left" if name == "confidence" else "right")
+    judged = rows[~fitted_to]
+    groups = {"all": judged, "usual shelf": judged[judged.usual], "others": judged[~judged.usual]}
+    groups |= {sensor: judged[judged.sensor == sensor] for sensor in sorted(set(judged.sensor))}
+    for kind in ("confidence", "fitted"):
+        for line in confidences.reliability(judged[kind].to_numpy(), judged.right.to_numpy()):
+            table.add_row(kind, *(f"{line[name]:.2f}" if name != "objects" else str(line[name]) for name in line))
+        for name, group in groups.items():
+            sure = group[group[kind] >= SURE]
+            if len(sure):
+                figures = (str(len(sure)), f"{sure.right.mean():.2f}", f"{sure[kind].mean():.2f}")
+                table.add_row(f"{kind}, {name}", f"{SURE:.2f}", "1.00", *figures)
+    console.print(table)
+    console.print("fitted constants:", ", ".join(f"{number:.3f}" for number in found))
+
+
+COMMANDS = {"looks": bench_looks, "bodies": bench_bodies, "sensors": bench_sensors, "confidence": bench_confidence}

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mechsearch_jax.benchmarks.lab.looks.confidences import ANGLE, CENTRE
 from mechsearch_jax.benchmarks.lab.looks.pictures import Picture, noisy_colour, noisy_depth
 from mechsearch_jax.benchmarks.lab.looks.scoring import (
     OFF,
@@ -129,14 +130,15 @@ class MeasuredLooks:
         return lines
 
     def reliability(self) -> list[dict[str, Any]]:
-        """How often recognised objects are not right, phantoms included, by segments, noise and stated confidence."""
+        """How often recognised objects, phantoms included, are not what their confidence is of (`confidences`), by
+        segments, noise and stated confidence."""
         lines = []
         for segments, noise in dict.fromkeys((row.segments, row.noise) for row in self.rows):
             kind = (segments, noise)
             stated = [
-                (row.confidence, row.outcome != "right")
+                (row.confidence, not (row.centre < CENTRE and row.angle < ANGLE))
                 for row in self.rows
-                if (row.segments, row.noise) == kind and row.confidence is not None
+                if (row.segments, row.noise) == kind and None not in (row.confidence, row.centre, row.angle)
             ]
             stated += [(p.confidence, True) for p in self.phantoms if (p.segments, p.noise) == kind]
             for low, high in itertools.pairwise(CONFIDENCES):
