@@ -326,6 +326,8 @@ def labelled(
       camera, view, shelf, images: as of `ViewRecogniser`.
     """
     seen, colour, mask, target_id = images
+    # A simulated camera may see what is beyond the image.
+    seen = jnp.where(view.is_inside(camera), seen, jnp.nan)
     points = back_project(view.camera, seen)
 
     # Points on the board's faces may be the target's.
