@@ -174,7 +174,7 @@ class Part:
     def points(self) -> Float[np.ndarray, "h w 3"]:
         """In the world [m]; NaN without a finite depth."""
         depth = np.where(np.isfinite(self.depth), self.depth, np.float32(np.nan))[..., None]
-        return np.float32(self.view.camera.position) + depth * self.ways
+        return np.array(self.view.camera.position, np.float32) + depth * self.ways
 
     @functools.cached_property
     def above_board(self) -> Bool[np.ndarray, "h w"]:

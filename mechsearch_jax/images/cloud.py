@@ -193,13 +193,12 @@ def thinned_view(camera: Camera, shelf: Shelf) -> View:
     if (tight.camera.height, tight.camera.width) == _usual_size():
         return tight
     low, high = _extent(camera, shelf)
-    for size in SIZES:
-        # The least with which all of it fits.
-        chosen = max(stride, *(-(-(high[i] - low[i]) // size[i]) for i in range(2)))
-        if chosen == stride or STRIDE * finer / chosen >= LEAST_DENSITY:
-            break
-    last = (camera.height - size[0] * chosen, camera.width - size[1] * chosen)
-    return _view_from(camera, (max(min(low[0], last[0]), 0), max(min(low[1], last[1]), 0)), size, chosen)
+    # The least strides with which all of it fits.
+    strides = [max(stride, *(-(-(high[i] - low[i]) // size[i]) for i in range(2))) for size in SIZES]
+    dense = strides[0] == stride or STRIDE * finer / strides[0] >= LEAST_DENSITY
+    size, stride = (SIZES[0], strides[0]) if dense else (SIZES[1], strides[1])
+    last = (camera.height - size[0] * stride, camera.width - size[1] * stride)
+    return _view_from(camera, (max(min(low[0], last[0]), 0), max(min(low[1], last[1]), 0)), size, stride)
 
 
 @functools.cache
@@ -229,9 +228,7 @@ def cloud_of(points: Float[Array, "h w 3"]) -> PointCloud:
     return PointCloud(jnp.where(valid[:, None], flat, 0.0), valid, jnp.arange(flat.shape[0], dtype=jnp.int32))
 
 
-def above_board(
-    shelf: Shelf, points: Float[Array | np.ndarray, "*batch 3"], margin: float = MARGIN
-) -> Bool[Array | np.ndarray, "*batch"]:
+def above_board(shelf: Shelf, points: Float[Array | np.ndarray, "*batch 3"], margin: float = MARGIN) -> Any:
     """Whether points lie in the free space of the shelf, farther than `margin` [m] from its faces. False for NaN."""
     x, y, z = (points[..., i] for i in range(3))
     deep = (x > shelf.front - OVERHANG) & (x < shelf.back - margin)
