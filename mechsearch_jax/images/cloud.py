@@ -31,8 +31,10 @@ OVERHANG = 0.06
 # few pixels larger or smaller, would recompile everything.
 BLOCK = 8
 # Views of all other cameras and poses have one of these numbers of rows and columns, also where they end beyond the
-# image: the larger where the smaller would have less than this share of the density of the networks' training.
-SIZES, LEAST_DENSITY = ((256, 488), (352, 688)), 0.75
+# image: the first for images of at most VGA, else the second; the last where that would have less than this share of
+# the density of the networks' training.
+SIZES, LEAST_DENSITY = ((240, 320), (256, 488), (352, 688)), 0.7
+VGA = (480, 640)
 # Pixels in a block of `draw`.
 _BLOCK = 64
 # Neighbouring pixels are on different surfaces if their points are farther apart by this than those beside them, of
@@ -194,9 +196,10 @@ def thinned_view(camera: Camera, shelf: Shelf) -> View:
         return tight
     low, high = _extent(camera, shelf)
     # The least strides with which all of it fits.
-    strides = [max(stride, *(-(-(high[i] - low[i]) // size[i]) for i in range(2))) for size in SIZES]
-    dense = strides[0] == stride or STRIDE * finer / strides[0] >= LEAST_DENSITY
-    size, stride = (SIZES[0], strides[0]) if dense else (SIZES[1], strides[1])
+    sizes = SIZES[0 if camera.height <= VGA[0] and camera.width <= VGA[1] else 1], SIZES[2]
+    strides = [max(stride, *(-(-(high[i] - low[i]) // size[i]) for i in range(2))) for size in sizes]
+    sparse = strides[0] > stride and STRIDE * finer / strides[0] < LEAST_DENSITY
+    size, stride = sizes[sparse], strides[sparse]
     last = (camera.height - size[0] * stride, camera.width - size[1] * stride)
     return _view_from(camera, (max(min(low[0], last[0]), 0), max(min(low[1], last[1]), 0)), size, stride)
 
