@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import types
 import warnings
 
 import jax
@@ -10,11 +11,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
-from mechsearch_jax.images.cloud import BLOCK, thinned_view, view
+from mechsearch_jax.images.cloud import BLOCK, STRIDE, middle, shelf_view, thinned_view, view
+from mechsearch_jax.images.labels import MISSING
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.runtime.compiled import CachedJit, keep_in
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.faults import check_image, recognition_warnings
+from mechsearch_jax.session.images import converted
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
@@ -187,13 +195,76 @@ def test_a_view_takes_its_rays_from_an_image_wherever_they_begin(stride, channel
     assert of._cache_size() == 1
 
 
-def test_a_view_in_blocks_stays_inside_the_image():
-    # Half of the default's pixels: its view then ends at the image's edge.
-    for camera in (Camera(), Camera().scaled(3), dataclasses.replace(Camera(), width=1090, height=700)):
-        seen = thinned_view(camera, SHELF)
-        for first, count, size in (
-            (seen.row, seen.camera.height, camera.height),
-            (seen.column, seen.camera.width, camera.width),
-        ):
-            assert 0 <= first < size - (count - 1) * seen.stride
-            assert count % BLOCK == 0 or count == -(-size // seen.stride)
+def wrist(down, distance, camera):
+    """The camera at a pose that looks at the middle of the board, down by an angle [degrees], from a distance [m]."""
+    angle = np.radians(down)
+    forward = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    rotation = np.stack([(0.0, -1.0, 0.0), np.cross(forward, (0.0, -1.0, 0.0)), forward], axis=1)
+    position = np.array([*middle(SHELF)]) - distance * forward
+    return dataclasses.replace(camera, rotation=tuple(map(tuple, rotation.tolist())), position=tuple(position.tolist()))
+
+
+@pytest.mark.parametrize(("width", "height", "focal"), [(1280, 720, 609.635), (640, 480, 525.0), (848, 480, 424.0)])
+def test_all_poses_of_a_camera_share_two_programs(width, height, focal):
+    """And the view of each shows all of the shelf that the image does, at about the density of training."""
+    one = dataclasses.replace(Camera(), width=width, height=height, fx=focal, fy=focal, cx=width / 2.0, cy=height / 2.0)
+    views, trained = [], Camera().fx / np.linalg.norm(np.subtract(Camera().position, middle(SHELF))) / STRIDE
+    for down in (10, 25, 45, 60):
+        for distance in (0.4, 0.7, 1.1, 1.6):
+            camera = wrist(down, distance, one)
+            seen, tight = thinned_view(camera, SHELF), shelf_view(camera, SHELF, 1)
+            inside = seen.inside(camera)
+            for first, count, wanted, end, size in (
+                (seen.row, inside.camera.height, tight.row, tight.row + tight.camera.height, height),
+                (seen.column, inside.camera.width, tight.column, tight.column + tight.camera.width, width),
+            ):
+                assert 0 <= first <= wanted
+                assert end - seen.stride < first + (count - 1) * seen.stride + 1 <= size
+            assert 0.65 < focal / distance / seen.stride / trained < 1.7
+            views.append(seen)
+    assert len({seen.stride for seen in views}) > 1
+    kinds = [traced_as(seen) for seen in views]
+    assert len(set(map(str, kinds))) <= 2
+
+
+def test_a_view_that_ends_beyond_the_image_has_no_depth_there():
+    camera = Camera().scaled(5)
+    seen = thinned_view(camera, SHELF)
+    image = np.arange(camera.height * camera.width, dtype=np.float32).reshape(camera.height, camera.width) + 1.0
+    part, inside = np.asarray(seen.of(jnp.asarray(image))), np.asarray(seen.is_inside(camera))
+    np.testing.assert_array_equal(np.isfinite(part), inside)
+    kept = seen.inside(camera)
+    np.testing.assert_array_equal(part[: kept.camera.height, : kept.camera.width], kept.cut(image))
+    assert kept.camera.height * kept.camera.width == inside.sum() < inside.size
+    number = np.asarray(seen.of(jnp.zeros((camera.height, camera.width), jnp.int32)))
+    assert (number[~inside] < MISSING).all()
+
+
+@pytest.mark.slow
+def test_another_pose_of_a_wrist_camera_compiles_nothing():
+    """Neither recognition nor the checks of its images."""
+    names = []
+
+    def count(name, seconds, **_):
+        if "backend_compile" in name:
+            names.append(name)
+
+    world, shelf, counted = from_scenario(load_scenario(example_scenarios()["first-light"])), Shelf(faces=()), []
+    looks = []
+    for down, distance in ((35, 0.8), (10, 1.6), (60, 0.45), (20, 0.6)):
+        camera = wrist(down, distance, Camera())
+        image = observe(camera, world, shelf)
+        depth = np.where(np.isfinite(image.depth), image.depth, 0.0).astype(np.float32)
+        looks.append((camera, converted(depth, np.uint8(255 * np.asarray(image.colour)), None, None)))
+    jax.monitoring.register_event_duration_secs_listener(count)
+    for camera, images in looks:
+        names.clear()
+        setting = types.SimpleNamespace(camera=camera, shelf=shelf, target=TARGET)
+        recognise = Recogniser(setting)
+        look, _ = check_image(setting, CalibrationLimits(), images, recognise)
+        seen = recognise.unchecked(KEY, *images).judged()
+        recognition_warnings(setting, look, seen, recognise)
+        counted.append(len(names))
+        assert seen.objects.valid.sum() >= 2
+    assert counted[0] > 0
+    assert counted[1:] == [0] * (len(looks) - 1)

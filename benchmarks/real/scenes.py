@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mechsearch_jax.images.bop import SCENE, bop_image, entries, visible_masks
-from mechsearch_jax.images.cloud import thinned_view
 from mechsearch_jax.images.image_files import camera_of, load_colour, number_array
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.runtime.files import is_file, is_folder
@@ -30,8 +29,6 @@ from mechsearch_jax.workspace.shelf import Shelf
 BOARD, BOP_BOARD = Shelf().board, 0.0
 # The table in front of the camera: from where to where before it, to either side, and up [m].
 NEAR, FAR, WIDE, HIGH = 0.35, 0.95, 0.5, 0.45
-# Its end may be up to so many steps of 2 cm off, so that views have one of few numbers of rows, and few are compiled.
-STEPS, ROWS = 6, (192, 216, 240)
 # A world in which the camera looks farther to the side is turned until it looks along x [degrees].
 SIDEWAYS = 30.0
 
@@ -63,9 +60,7 @@ class LabelledScene:
         camera = ahead(self.camera)
         x, y, _ = camera.position
         sides = (y - WIDE, y + WIDE, self.board, self.board + HIGH)
-        ends = sorted(range(-STEPS, STEPS + 1), key=lambda step: (abs(step), -step))
-        tables = [Shelf(x + NEAR, x + FAR + 0.02 * step, *sides) for step in ends]
-        return camera, next((t for t in tables if thinned_view(camera, t).camera.height in ROWS), tables[0])
+        return camera, Shelf(x + NEAR, x + FAR, *sides)
 
 
 def ahead(camera: Camera) -> Camera:

@@ -22,7 +22,7 @@ from mechsearch_jax.images.detection import coloured_pixels
 from mechsearch_jax.images.labels import INSTANCES, MISSING
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, back_project, measured, rays
+from mechsearch_jax.workspace.camera import Camera, measured
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import enters
@@ -134,21 +134,27 @@ class Look:
     @functools.cached_property
     def thinned(self) -> Part:
         """The pixels that recognition uses."""
-        return Part(self, thinned_view(self.camera, self.shelf))
+        view = thinned_view(self.camera, self.shelf)
+        return Part(self, view.inside(self.camera), (view.camera.height, view.camera.width))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Part:
-    """What a view shows of a look; only with a colour image and a detector it has pixels of the target's colour."""
+    """What a view shows of a look; only with a colour image and a detector it has pixels of the target's colour.
+
+    Attributes:
+      look: the look.
+      view: its rays that lie in the image.
+      size: rows and columns of what a detector is called with; those of the view if None.
+    """
 
     look: Look
     view: View
+    size: tuple[int, int] | None = None
 
     def of(self, image: np.ndarray) -> np.ndarray:
         """The view's pixels of a full image."""
-        camera, stride = self.view.camera, self.view.stride
-        part = image[self.view.row :: stride, self.view.column :: stride]
-        return part[: camera.height, : camera.width]
+        return self.view.cut(image)
 
     @functools.cached_property
     def depth(self) -> Float[np.ndarray, "h w"]:
@@ -157,14 +163,23 @@ class Part:
         return np.where(measured(part), part, np.float32(np.nan))
 
     @functools.cached_property
+    def ways(self) -> Float[np.ndarray, "h w 3"]:
+        """Directions of the rays in the world, of unit depth; with NumPy, which compiles nothing for another size."""
+        camera = self.view.camera
+        rows, columns = np.arange(camera.height), np.arange(camera.width)
+        v, u = np.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
+        return (np.stack([u, v, np.ones_like(u)], axis=-1) @ np.array(camera.rotation).T).astype(np.float32)
+
+    @functools.cached_property
     def points(self) -> Float[np.ndarray, "h w 3"]:
         """In the world [m]; NaN without a finite depth."""
-        return np.asarray(back_project(self.view.camera, jnp.asarray(self.depth)))
+        depth = np.where(np.isfinite(self.depth), self.depth, np.float32(np.nan))[..., None]
+        return np.array(self.view.camera.position, np.float32) + depth * self.ways
 
     @functools.cached_property
     def above_board(self) -> Bool[np.ndarray, "h w"]:
         """Which pixels show something in the shelf's free space."""
-        return np.asarray(above_board(self.look.shelf, jnp.asarray(self.points)))
+        return np.asarray(above_board(self.look.shelf, self.points))
 
     @functools.cached_property
     def colour(self) -> Float[np.ndarray, "h w 3"]:
@@ -180,13 +195,21 @@ class Part:
     def judged(self, colour: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
         """Those of another colour image of the view."""
         assert self.look.detector is not None
-        return np.asarray(self.look.detector(jnp.asarray(colour)))
+        height, width, _ = colour.shape
+        return np.asarray(self.look.detector(self._filled(colour)))[:height, :width]
+
+    def _filled(self, image: np.ndarray, rest: float = 0.0) -> jax.Array:
+        """An image of the view with a number in the rest of `size`: nothing is compiled anew for another pose."""
+        size = (*(self.size or image.shape[:2]), *image.shape[2:])
+        beyond = [(0, full - count) for full, count in zip(size, image.shape, strict=True)]
+        return jnp.asarray(np.pad(image, beyond, constant_values=rest))
 
     def elected(self, colour: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
         """Those in the shelf's free space by a vote among neighbours, which is slow."""
         assert self.look.detector is not None
-        chosen = coloured_pixels(self.look.detector, jnp.asarray(colour), jnp.asarray(self.depth))
-        return np.asarray(chosen) & self.above_board
+        chosen = coloured_pixels(self.look.detector, self._filled(colour), self._filled(self.depth, np.nan))
+        height, width = self.depth.shape
+        return np.asarray(chosen)[:height, :width] & self.above_board
 
 
 def _numbered(pixels: Bool[np.ndarray, "h w"], around: np.ndarray | None = None) -> Int[np.ndarray, "h w"]:
@@ -246,5 +269,4 @@ def unmeasured_target_faults(look: Look, observation: Observation) -> tuple[str,
 
 def _into_shelf(part: Part) -> Bool[np.ndarray, "h w"]:
     """Which rays enter the shelf's free space through an opening."""
-    camera = part.view.camera
-    return enters(part.look.shelf, np.array(camera.position), np.asarray(rays(camera)), RIM)
+    return enters(part.look.shelf, np.array(part.view.camera.position), part.ways, RIM)

@@ -27,9 +27,14 @@ STRIDE = 2
 MARGIN = 0.004
 # How far objects may stick out over the board's front edge [m].
 OVERHANG = 0.06
-# Views for networks have a multiple of so many rows and columns, if the image has them. Otherwise a recalibrated
-# camera, whose view is a few pixels larger or smaller, would recompile everything.
+# The default camera's view has a multiple of so many rows and columns. Otherwise a recalibrated camera, whose view is a
+# few pixels larger or smaller, would recompile everything.
 BLOCK = 8
+# Views of all other cameras and poses have one of these numbers of rows and columns, also where they end beyond the
+# image: the first for images of at most VGA, else the second; the last where that would have less than this share of
+# the density of the networks' training.
+SIZES, LEAST_DENSITY = ((240, 320), (256, 488), (352, 688)), 0.7
+VGA = (480, 640)
 # Pixels in a block of `draw`.
 _BLOCK = 64
 # Neighbouring pixels are on different surfaces if their points are farther apart by this than those beside them, of
@@ -41,15 +46,15 @@ _SPREADS = 12
 _SMALL, _LEAST = 16, 24
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=("camera", "row", "column"), meta_fields=("stride",))
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("camera", "row", "column", "stride"), meta_fields=())
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Every `stride`-th ray of a part of a camera's image: a pytree, of which sizes and stride are static.
+    """Every `stride`-th ray of a part of a camera's image: a pytree, of which only the sizes are static.
 
     Attributes:
       camera: the pinhole camera whose image consists of exactly these rays.
       row, column: of the first ray in the full image.
-      stride: distance of neighbouring rays in the full image, in pixels; static.
+      stride: distance of neighbouring rays in the full image, in pixels.
     """
 
     camera: Camera
@@ -58,11 +63,28 @@ class View:
     stride: int
 
     def of(self, image: Shaped[Array, "height width *channels"]) -> Shaped[Array, "h w *channels"]:
-        """The view's pixels of a full image."""
-        size = [(count - 1) * self.stride + 1 for count in (self.camera.height, self.camera.width)]
-        corner = (self.row, self.column, *[0] * (image.ndim - 2))
-        part = jax.lax.dynamic_slice(image, corner, (*size, *image.shape[2:]))
-        return part[:: self.stride, :: self.stride]
+        """The view's pixels of a full image; beyond it NaN, or an integer that is no label."""
+        rows, columns = (
+            first + self.stride * jnp.arange(count)
+            for first, count in ((self.row, self.camera.height), (self.column, self.camera.width))
+        )
+        return image.at[rows].get(mode="fill").at[:, columns].get(mode="fill")
+
+    def cut(self, image: Shaped[np.ndarray, "height width *channels"]) -> Shaped[np.ndarray, "h w *channels"]:
+        """The same of a view that lies in the image, on the host: another size of views compiles nothing."""
+        part = image[self.row :: self.stride, self.column :: self.stride]
+        return part[: self.camera.height, : self.camera.width]
+
+    def is_inside(self, camera: Camera) -> Bool[Array, "h w"]:
+        """Which rays lie in the image of the camera that it is a view of."""
+        rows, columns = (self.stride * jnp.arange(count) for count in (self.camera.height, self.camera.width))
+        return (self.row + rows < camera.height)[:, None] & (self.column + columns < camera.width)[None]
+
+    def inside(self, camera: Camera) -> View:
+        """The rays of it that lie in the image of a camera, which it is a view of; on the host."""
+        height = min(self.camera.height, -(-(camera.height - self.row) // self.stride))
+        width = min(self.camera.width, -(-(camera.width - self.column) // self.stride))
+        return dataclasses.replace(self, camera=dataclasses.replace(self.camera, height=height, width=width))
 
 
 def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride: int = 1) -> View:
@@ -77,16 +99,22 @@ def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride
             f"view: rows {rows}, columns {columns}, stride {stride} do not fit an image of "
             f"{camera.height} rows and {camera.width} columns"
         )
+    size = (-(-(rows[1] - rows[0]) // stride), -(-(columns[1] - columns[0]) // stride))
+    return _view_from(camera, (rows[0], columns[0]), size, stride)
+
+
+def _view_from(camera: Camera, first: tuple[int, int], size: tuple[int, int], stride: int) -> View:
+    """The view that begins at a pixel of the image."""
     seen = dataclasses.replace(
         camera,
-        height=-(-(rows[1] - rows[0]) // stride),
-        width=-(-(columns[1] - columns[0]) // stride),
+        height=size[0],
+        width=size[1],
         fx=camera.fx / stride,
         fy=camera.fy / stride,
-        cx=(camera.cx - columns[0] - 0.5) / stride + 0.5,
-        cy=(camera.cy - rows[0] - 0.5) / stride + 0.5,
+        cx=(camera.cx - first[1] - 0.5) / stride + 0.5,
+        cy=(camera.cy - first[0] - 0.5) / stride + 0.5,
     )
-    return View(seen, rows[0], columns[0], stride)
+    return View(seen, *first, stride)
 
 
 def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride: int = STRIDE, block: int = 1) -> View:
@@ -103,6 +131,18 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
       InputError: the camera does not see the shelf.
     """
     camera, shelf = camera or Camera(), shelf or Shelf()
+    low, high = _extent(camera, shelf)
+    sizes = (camera.height, camera.width)
+    rows, columns = (_in_blocks(low[i], high[i], sizes[i], stride, block) for i in range(2))
+    return view(camera, rows, columns, stride)
+
+
+def _extent(camera: Camera, shelf: Shelf) -> tuple[list[int], list[int]]:
+    """First and last + 1 row and column of the part of the image in which things on the board can appear.
+
+    Raises:
+      InputError: the camera does not see the shelf.
+    """
     tops = (shelf.board, min(shelf.board + 0.25, shelf.ceiling))
     sides = ((shelf.front - OVERHANG, shelf.back), (shelf.right, shelf.left), tops)
     corners = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(8, 3)
@@ -113,9 +153,7 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     high = np.minimum(np.ceil(pixels.max(axis=0)) + 1, (camera.height, camera.width)).astype(int)
     if (depth <= 0).any() or (low >= high).any():
         raise InputError("shelf_view: the camera does not look into the shelf; check its pose")
-    sizes = (camera.height, camera.width)
-    rows, columns = (_in_blocks(int(low[i]), int(high[i]), sizes[i], stride, block) for i in range(2))
-    return view(camera, rows, columns, stride)
+    return low.tolist(), high.tolist()
 
 
 def _in_blocks(first: int, end: int, size: int, stride: int, block: int) -> tuple[int, int]:
@@ -145,13 +183,31 @@ def density(camera: Camera, shelf: Shelf) -> float:
 def thinned_view(camera: Camera, shelf: Shelf) -> View:
     """The shelf's part of a camera's image for networks, thinned to about the density of their training.
 
-    Camera and shelf must not be traced, for they decide the view's shape.
+    Views have one of `SIZES`, so that the next pose of a camera compiles nothing, or the size of the default camera's
+    where they see the shelf as it does. They may end beyond the image. Camera and shelf must not be traced.
 
     Raises:
       InputError: the camera does not see the shelf.
     """
     finer = density(camera, shelf) / density(Camera(), Shelf())
-    return shelf_view(camera, shelf, max(1, round(STRIDE * finer)), BLOCK)
+    stride = max(1, round(STRIDE * finer))
+    tight = shelf_view(camera, shelf, stride, BLOCK)
+    if (tight.camera.height, tight.camera.width) == _usual_size():
+        return tight
+    low, high = _extent(camera, shelf)
+    # The least strides with which all of it fits.
+    sizes = SIZES[0 if camera.height <= VGA[0] and camera.width <= VGA[1] else 1], SIZES[2]
+    strides = [max(stride, *(-(-(high[i] - low[i]) // size[i]) for i in range(2))) for size in sizes]
+    sparse = strides[0] > stride and STRIDE * finer / strides[0] < LEAST_DENSITY
+    size, stride = sizes[sparse], strides[sparse]
+    last = (camera.height - size[0] * stride, camera.width - size[1] * stride)
+    return _view_from(camera, (max(min(low[0], last[0]), 0), max(min(low[1], last[1]), 0)), size, stride)
+
+
+@functools.cache
+def _usual_size() -> tuple[int, int]:
+    seen = shelf_view(block=BLOCK).camera
+    return seen.height, seen.width
 
 
 class PointCloud(PyTreeNode):
@@ -175,7 +231,7 @@ def cloud_of(points: Float[Array, "h w 3"]) -> PointCloud:
     return PointCloud(jnp.where(valid[:, None], flat, 0.0), valid, jnp.arange(flat.shape[0], dtype=jnp.int32))
 
 
-def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = MARGIN) -> Bool[Array, "*batch"]:
+def above_board(shelf: Shelf, points: Float[Array | np.ndarray, "*batch 3"], margin: float = MARGIN) -> Any:
     """Whether points lie in the free space of the shelf, farther than `margin` [m] from its faces. False for NaN."""
     x, y, z = (points[..., i] for i in range(3))
     deep = (x > shelf.front - OVERHANG) & (x < shelf.back - margin)

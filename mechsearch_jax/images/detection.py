@@ -228,7 +228,7 @@ def detect(
     shelf: Shelf,
     camera: Camera,
     image: ColouredDepth,
-    threshold: float,
+    threshold: Array | float,
 ) -> Detection:
     """Find the target's pixels.
 

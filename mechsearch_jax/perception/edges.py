@@ -94,7 +94,7 @@ def edge_faults(
     if colour is None:
         return ()
     view = shelf_view(camera, shelf, 1)
-    depth, colour = (np.asarray(view.of(jnp.asarray(image))) for image in (depth, colour))
+    depth, colour = (view.cut(np.asarray(image)) for image in (depth, colour))
     beyond = [_beyond(ends_of(depth, 1, sign), colour) for sign in (1, -1)]
     # Where one side is not seen, a colour image beside the depth image would look the same.
     reach = float(np.mean(beyond))
@@ -148,7 +148,7 @@ def mask_faults(
 
 def _away_from_edges(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.ndarray) -> str | None:
     view = shelf_view(camera, shelf, 1)
-    depth, mask = (np.asarray(view.of(jnp.asarray(image))) for image in (depth, mask))
+    depth, mask = (view.cut(np.asarray(image)) for image in (depth, mask))
     points = back_project(view.camera, jnp.asarray(np.where(depth > 0, depth, np.nan)))
     standing = np.asarray(above_board(shelf, points, FACES))
     named = np.where((mask >= 0) & (mask < INSTANCES), mask, OTHER)

@@ -129,7 +129,7 @@ class Fitter(Protocol):
         shelf: Shelf,
         target: Target,
         refinement: RefinementConfig,
-        least: float = 0.0,
+        least: Float[Array, ""] | float = 0.0,
     ) -> Fitted:
         """Fit the objects.
 
@@ -152,7 +152,7 @@ def as_segmented(
     shelf: Shelf,
     target: Target,
     refinement: RefinementConfig,
-    least: float = 0.0,
+    least: Float[Array, ""] | float = 0.0,
 ) -> Fitted:
     """The `Fitter` that keeps the segments as they are, such as true masks."""
     return explained_image(keys, image, shapes, camera, shelf, target, refinement, AS_SEGMENTED, least)
@@ -177,7 +177,7 @@ class Explaining:
         shelf: Shelf,
         target: Target,
         refinement: RefinementConfig,
-        least: float = 0.0,
+        least: Float[Array, ""] | float = 0.0,
     ) -> Fitted:
         return explained_image(keys, image, shapes, camera, shelf, target, refinement, self.config, least)
 

@@ -20,7 +20,7 @@ from mechsearch_jax.images.planes import TOLERANCE, find_plane
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.camera import Camera, project, rays
+from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import FACES, Shelf
 from mechsearch_jax.workspace.sight import ends_in_shelf
@@ -70,9 +70,9 @@ def image_faults(look: Look) -> tuple[str, ...]:
             "depth image: nothing was measured where it shows the shelf; it must hold metres along the camera's axis, "
             "and the sensor must be able to see the shelf"
         )
-    view, judged = look.whole.view.camera, measured
+    judged = measured
     if set(shelf.faces) < set(FACES):
-        judged = measured[ends_in_shelf(shelf, np.array(view.position), np.asarray(rays(view)))]
+        judged = measured[ends_in_shelf(shelf, np.array(camera.position), look.whole.ways)]
     if judged.mean() < LEAST_MEASURED:
         return (
             f"depth image: {100 * judged.mean():.0f}% of the pixels that show the shelf have a depth; it must be in "
@@ -222,7 +222,7 @@ def identity_faults(look: Look, target_id: int | None) -> tuple[str, ...]:
 
 
 # Operation by operation it is hundreds of programs.
-_fitted_pose = jax.jit(fitted_pose, static_argnames=("target", "shelf", "camera"))
+_fitted_pose = jax.jit(fitted_pose, static_argnames="target")
 
 
 def colour_faults(look: Look, target: Target) -> tuple[str, ...]:
@@ -286,7 +286,7 @@ def sight_faults(look: Look, observation: Observation) -> tuple[str, ...]:
     if not shows_nothing(observation):
         return ()
     part = look.thinned
-    standing = int(jnp.sum(above_board(look.shelf, jnp.asarray(part.points), FLOOR_TOLERANCE))) * part.view.stride**2
+    standing = int(above_board(look.shelf, part.points, FLOOR_TOLERANCE).sum()) * part.view.stride**2
     if standing > SOMETHING * found_pixels(look.camera, 1):
         return ("recognition: something stands on the shelf, but no object and no target is recognised",)
     return (EMPTY_SHELF,)

@@ -309,7 +309,7 @@ def view_images(view: View, depth: Any, colour: Any, mask: Any, target_id: Any) 
     return ViewImages(jnp.where(measured(seen), seen, jnp.nan), colour, mask, target_id)
 
 
-def _threshold(camera: Camera, view: View) -> float:
+def _threshold(camera: Camera, view: View) -> float | Array:
     """A target of at most this many pixels of a view is not visible."""
     return found_pixels(camera) / view.stride**2
 
@@ -326,6 +326,8 @@ def labelled(
       camera, view, shelf, images: as of `ViewRecogniser`.
     """
     seen, colour, mask, target_id = images
+    # A simulated camera may see what is beyond the image.
+    seen = jnp.where(view.is_inside(camera), seen, jnp.nan)
     points = back_project(view.camera, seen)
 
     # Points on the board's faces may be the target's.
@@ -355,7 +357,7 @@ def labelled(
     return image, visible
 
 
-def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:
+def large_segments(labels: Int[Array, "h w"], pixels: float | Array) -> Int[Array, "h w"]:
     """Labels with segments, numbered from 0, of at most `pixels` pixels set to OTHER."""
     small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
     return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)

@@ -109,7 +109,7 @@ class InParts:
         shelf: Shelf,
         target: Target,
         refinement: RefinementConfig,
-        least: float = 0.0,
+        least: Float[Array, ""] | float = 0.0,
     ) -> Fitted:
         fitted = self.of(keys, image, shapes, camera, shelf, target, refinement, least)
         return in_parts(image, fitted, camera, shelf, self.config, self.joining)

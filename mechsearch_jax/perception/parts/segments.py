@@ -68,7 +68,7 @@ class Connected:
         shelf: Shelf,
         target: Target,
         refinement: RefinementConfig,
-        least: float = 0.0,
+        least: Float[Array, ""] | float = 0.0,
     ) -> Fitted:
         labels = connected_segments(image.points, image.labels, self.config, least)
         return self.of(keys, image.replace(labels=labels), shapes, camera, shelf, target, refinement, least)
