@@ -183,8 +183,8 @@ def density(camera: Camera, shelf: Shelf) -> float:
 def thinned_view(camera: Camera, shelf: Shelf) -> View:
     """The shelf's part of a camera's image for networks, thinned to about the density of their training.
 
-    Views have one of `SIZES`, so that the next pose of a camera compiles nothing, or the size of the default camera's
-    where they see the shelf as it does. They may end beyond the image. Camera and shelf must not be traced.
+    Views of one camera have one of two `SIZES`, so that another pose compiles nothing, or the size of the default
+    camera's where they see the shelf as it does. They may end beyond the image. Camera and shelf must not be traced.
 
     Raises:
       InputError: the camera does not see the shelf.

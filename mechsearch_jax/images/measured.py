@@ -50,7 +50,7 @@ def measured_share(camera: Camera, view: View, depth: Float[Array, "h w"]) -> Fl
 
 
 def _blocks(
-    count: int, step: int, first: int | Int[Array, ""], stride: int, rays: int
+    count: int, step: int, first: int | Int[Array, ""], stride: int | Int[Array, ""], rays: int
 ) -> tuple[Float[Array, "count rays"], Int[Array, " count"]]:
     """Which of the rays along an axis lie in each block, as ones, and the ray nearest to each block's middle."""
     block = (first + stride * jnp.arange(rays)) // step
