@@ -116,7 +116,8 @@ def test_visible_objects_are_refined_to_their_true_shapes(noise, least):
         (0, SHELF.front - 0.07, False),
         (1, SHELF.right - 0.001, False),
         (1, SHELF.left + 0.001, False),
-        (2, SHELF.board - 0.001, False),
+        (2, SHELF.board - 0.003, True),
+        (2, SHELF.board - 0.005, False),
         (2, SHELF.ceiling + 0.001, False),
     ],
 )
@@ -128,6 +129,16 @@ def test_an_object_whose_centre_is_outside_of_the_shelf_is_none(axis, place, sta
     expected = np.array(truth.valid)
     expected[:, 1] = stays
     np.testing.assert_array_equal(refined.scene.valid, expected)
+
+
+def test_a_guess_that_reaches_below_the_board_ends_on_it():
+    points, labels, depth, truth = measured([SCENE], np.random.default_rng(0), 0.001)
+    guess = truth.replace(position=truth.position.at[:, 1, 2].add(-0.05), size=truth.size.at[:, 1, 2].add(0.05))
+    refined = refiner()(guess, points, labels, depth).scene
+    # In float64, from the fitted shape's axes.
+    size, R, place = (np.asarray(a[0, 1], float) for a in (refined.size, refined.rotation, refined.position))
+    lowest = place[2] - np.abs(R[2]) @ size
+    assert abs(lowest - SHELF.board) < 0.002
 
 
 @pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not beside this checkout")

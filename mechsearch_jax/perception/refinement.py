@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
 from mechsearch_jax.geometry.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
-from mechsearch_jax.images.cloud import above_board
+from mechsearch_jax.images.cloud import MARGIN, above_board
 from mechsearch_jax.perception.scores import EDGE
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.pytree import PyTreeNode
@@ -323,6 +323,7 @@ def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: Ref
             x + _support(shape, (1.0, 0.0, 0.0)) - walls.back,
             y + _support(shape, (0.0, 1.0, 0.0)) - walls.left,
             walls.right - y + _support(shape, (0.0, 1.0, 0.0)),
+            -height * config.contact,
         ]
     )
     out_of_round = (shape.log_size[0] - shape.log_size[1]) * jnp.where(shape.exponents[1] > EDGE, 100.0, 0.0)
@@ -453,7 +454,8 @@ def refine(
 
     Returns:
       the refined scene and diagnostics. Absent objects and those with too few points are unchanged. One whose centre
-      lies outside the shelf's faces, or more than `cloud.OVERHANG` in front of it, is none, and becomes absent.
+      lies outside the shelf's faces, by `cloud.MARGIN` for the board, or more than `cloud.OVERHANG` in front of it, is
+      none, and becomes absent.
     """
     config = config or RefinementConfig()
     origin = jnp.array(camera.position)
@@ -482,7 +484,9 @@ def refine(
         misfit = _misfit(shape, origin, evidence)
         refined = Superquadrics(jnp.exp(shape.log_size), shape.exponents, shape.position, shape.rotation, given.valid)
         kept = jax.tree.map(lambda a, b: jnp.where(usable & jnp.isfinite(cost), a, b), refined, given)
-        kept = kept.replace(valid=kept.valid & above_board(shelf, kept.position, 0.0))
+        # A flat thing seems to reach as far below the board as camera and board are off.
+        raised = kept.position.at[2].add(MARGIN)
+        kept = kept.replace(valid=kept.valid & above_board(shelf, raised, 0.0))
         return Refined(kept, cost, initial, count, best.astype(jnp.int32), misfit)
 
     return jax.vmap(refine_object)(scene, jnp.arange(scene.capacity) if owners is None else owners)
