@@ -25,7 +25,7 @@ CAMERA, SHELF = Camera(), Shelf()
 VIEW = thinned_view(CAMERA, SHELF)
 MIDDLE = (SHELF.front + SHELF.back) / 2, (SHELF.left + SHELF.right) / 2
 EYE = np.array([-0.05, 0.45, 0.9])
-KINDS = BOX, UPRIGHT, ALONG_X, ALONG_Y = range(SHAPES)
+KINDS = BOX, UPRIGHT, ALONG_X, ALONG_Y, LEANING = range(SHAPES)
 
 
 def box_points(half, count, rng):
@@ -78,6 +78,24 @@ def test_half_a_cylinder_is_guessed_whole_and_one_on_its_edge_along_its_axis():
     tin = jax.tree.map(lambda a: np.asarray(a)[[ALONG_X, ALONG_Y][axis]], lying)
     assert abs(tin.rotation[1, 2]) > 0.99
     np.testing.assert_allclose(tin.size, (radius, radius, 0.03), atol=0.01)
+
+
+@pytest.mark.parametrize(("turn", "lean"), [(0.0, 0.25), (0.9, -0.3), (-0.5, 1.5708)])
+def test_a_leaning_box_is_guessed_from_one_face(turn, lean):
+    """Of a leaning book or a flat thing that lies only the face towards the camera is seen."""
+    half = np.array([0.01, 0.07, 0.1])
+    R = Rotation.from_euler("zy", (turn, lean)).as_matrix()
+    face = np.random.default_rng(4).uniform(-1, 1, (250, 3)) * half
+    place = np.array([0.6, 0.1, 0.5])
+    towards = np.sign(R[:, 0] @ (EYE - place))
+    face[:, 0] = half[0] * towards
+    guess = guessed(face @ R.T + place, 0.4)
+    axes, size = np.asarray(guess.rotation[LEANING], float), np.asarray(guess.size[LEANING], float)
+    assert np.abs(axes[:, 2] @ R[:, 0]) > np.cos(np.radians(1))
+    np.testing.assert_allclose(size[2], half[0], atol=1e-3)
+    np.testing.assert_allclose(np.sort(size), half, atol=0.012)
+    np.testing.assert_allclose(guess.position[LEANING], place, atol=0.008)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-5)
 
 
 def test_nothing_is_guessed_without_points_and_one_face_reaches_away_from_the_camera():

@@ -28,13 +28,14 @@ _FAR = 0.01
 _THIN = 0.01
 # A guess's axes in the order in which a cylinder along each of them has its own: about z, x and y.
 _ALONG = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-SHAPES = 1 + len(_ALONG)
+SHAPES = 2 + len(_ALONG)
 
 
 def rough_shapes(
     points: Float[Array, "p 3"], valid: Bool[Array, " p"], eye: Float[Array, " 3"], board: Float[Array, ""] | float
 ) -> Superquadrics:
-    """An upright box around points, and cylinders whose axes are upright or one of the box's level axes.
+    """An upright box around points, cylinders whose axes are upright or one of the box's level axes, and a box with its
+    face in the points' plane and a level edge, such as a leaning book.
 
     Args:
       points: in the world [m]; finite.
@@ -68,13 +69,32 @@ def rough_shapes(
     radius = (ends_ahead[1, 1] - ends_ahead[1, 0]) / 2
     ends_ahead = ends_ahead.at[0, 1].set(ends_ahead[0, 0] + 2 * radius)
     upright = _around(ends_ahead, heading, eye, half_height, board)
-    guesses = [box, upright, box, box]
+    guesses = [box, upright, box, box, _leaning(points, valid, eye)]
     size, position, rotation = (jnp.stack(part) for part in zip(*guesses, strict=True))
-    order = jnp.asarray(((0, 1, 2), *_ALONG))
+    order = jnp.asarray(((0, 1, 2), *_ALONG, (0, 1, 2)))
     size = jnp.take_along_axis(size, order, axis=1)
     rotation = jnp.take_along_axis(rotation, order[:, None, :], axis=2)
-    exponents = jnp.asarray([(_SHARP, _SHARP)] + [(_SHARP, 1.0)] * len(_ALONG), jnp.float32)
+    edges = (_SHARP, _SHARP)
+    exponents = jnp.asarray([edges, *[(_SHARP, 1.0)] * len(_ALONG), edges], jnp.float32)
     return Superquadrics(size, exponents, position, rotation, jnp.full(SHAPES, jnp.any(valid)))
+
+
+def _leaning(points: Array, valid: Array, eye: Array) -> tuple[Array, ...]:
+    """Half-extents, centre and rotation of a box of which the points show one face: its axes are level, up the face,
+    and away from the eye."""
+    middle = jnp.sum(jnp.where(valid[:, None], points, 0.0), axis=0) / jnp.maximum(jnp.sum(valid), 1)
+    offset = jnp.where(valid[:, None], points - middle[None], 0.0)
+    _, axes = jnp.linalg.eigh(jnp.matmul(offset.T, offset, precision="highest"))
+    away = axes[:, 0] * jnp.where(jnp.dot(axes[:, 0], middle - eye) < 0.0, -1.0, 1.0)
+    # The most level direction of the plane; any of a level plane.
+    level = jnp.stack([-away[1], away[0], 0.0 * away[2]])
+    length = jnp.sqrt(jnp.sum(level**2) + 1e-12)
+    level = jnp.where(length > 1e-3, level / length, axes[:, 2])
+    R = jnp.stack([level, jnp.cross(away, level), away], axis=1)
+    ends = jnp.stack([jnp.stack(_ends(place, valid)) for place in jnp.matmul(offset, R, precision="highest").T])
+    half = jnp.maximum((ends[:, 1] - ends[:, 0]) / 2, _THIN)
+    centre = jnp.mean(ends, axis=1).at[2].set(ends[2, 0] + half[2])
+    return half, middle + jnp.matmul(R, centre, precision="highest"), R
 
 
 def _ends(values: Float[Array, " p"], valid: Bool[Array, " p"]) -> tuple[Array, Array]:
