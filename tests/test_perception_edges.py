@@ -1,5 +1,6 @@
 """Edges of depth, colour and mask; surfaces: of a mask, of a cloud, and those on which nothing is recognised."""
 
+import dataclasses
 import types
 
 import jax
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import grey_dilation, minimum_filter
 
-from mechsearch_jax.images.cloud import cloud_of, resample
+from mechsearch_jax.images.cloud import above_board, cloud_of, hanging, resample, shelf_view, surfaces, walled
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import lost_faults
 from mechsearch_jax.perception.edges import edge_faults, mask_faults, on_own_surfaces
+from mechsearch_jax.workspace.camera import rays
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -142,3 +144,40 @@ def test_a_surface_on_which_nothing_is_recognised_is_said(missed):
     faults = lost_faults(SETTING, Observation(objects, jnp.array(False), jnp.zeros(3)), DEPTH)
     assert len(faults) == (missed is not None)
     assert all(fault.startswith("recognition: what shows ") for fault in faults)
+
+
+@pytest.mark.parametrize(("low", "hangs"), [(SHELF.ceiling - 0.04, True), (SHELF.board + 0.01, False)])
+def test_what_hangs_in_the_opening_is_no_object_and_is_said(low, hangs):
+    """A plate across the opening, down from the upper board: a lip, or something that stands on the board."""
+    view = shelf_view(IMAGES.camera, SHELF, 4)
+    directions, eye = np.asarray(rays(view.camera), float), np.array(IMAGES.camera.position)
+    length = (SHELF.front + 0.01 - eye[0]) / directions[..., 0]
+    plate = eye + length[..., None] * directions
+    within = (plate[..., 2] > low) & (plate[..., 2] < SHELF.ceiling) & (np.abs(plate[..., 1] - 0.1) < 0.1)
+    points = jnp.asarray(np.where(within[..., None], plate, np.nan), jnp.float32)
+    standing = above_board(SHELF, points)
+    left_out = np.asarray(hanging(SHELF, points, standing, surfaces(points, standing)))
+    assert np.array_equal(left_out, np.asarray(standing) & hangs)
+    # A shelf without an upper board has nothing that could hang from it.
+    table = dataclasses.replace(SHELF, faces=("back", "right", "left"))
+    assert not np.asarray(hanging(table, points, standing, surfaces(points, standing))).any()
+
+
+@pytest.mark.parametrize(
+    ("off", "noise", "moved"),
+    [(0.0, 0.0007, 0.0), (0.0, 0.003, 0.0035), (0.002, 0.003, 0.0055), (-0.006, 0.001, 0.0), (0.04, 0.001, 0.0)],
+)
+def test_a_wall_ends_where_its_own_points_do(off, noise, moved):
+    """The left wall is measured farther in than it is said to be, with noise; a thing stands 2 cm before it."""
+    rng, count = np.random.default_rng(0), 4000
+    wall = rng.uniform((SHELF.front, 0, SHELF.board), (SHELF.back, 0, SHELF.ceiling), (count, 3))
+    wall[:, 1] = SHELF.left - off + noise * rng.normal(size=count)
+    thing = rng.uniform((0.5, SHELF.left - 0.1, 0.45), (0.5, SHELF.left - 0.02, 0.6), (count, 3))
+    points = jnp.asarray(np.concatenate([wall, thing, np.full((100, 3), np.nan)]), jnp.float32)
+    seen = walled(SHELF, points)
+    # The margin of 4 mm is enough for a wall with little noise.
+    np.testing.assert_allclose(SHELF.left - float(seen.left), moved, atol=0.0015)
+    assert (float(seen.back), float(seen.right)) == pytest.approx((SHELF.back, SHELF.right))
+    assert int(above_board(seen, points)[count:].sum()) == count
+    if off < 0.01:
+        assert int(above_board(seen, points)[:count].sum()) < 0.03 * count

@@ -25,6 +25,14 @@ POINTS = 2048
 STRIDE = 2
 # Points within this distance of the shelf's faces count as the shelf [m].
 MARGIN = 0.004
+# Points are a wall's or near it up to this distance; a wall is measured up to `OFF` from its place [m]. It is seen with
+# so many points near it, of which such a share are within so many standard deviations of its noise; bins of distances.
+NEAR_WALL, OFF = 0.025, 0.012
+_WALL_POINTS, _WALL_SHARE, _DEVIATIONS, _BINS = 100, 0.7, 2.5, 50
+# Least share of points clearly behind a wall's place, where nothing but a noisy wall is measured.
+_BEHIND = 0.05
+# A surface hangs in the shelf's opening if such a share of it is in the upper half, up to so far behind its edge [m].
+HANGING, LIP = 0.9, 0.02
 # How far objects may stick out over the board's front edge [m].
 OVERHANG = 0.06
 # The default camera's view has a multiple of so many rows and columns. Otherwise a recalibrated camera, whose view is a
@@ -239,6 +247,50 @@ def above_board(shelf: Shelf, points: Float[Array | np.ndarray, "*batch 3"], mar
     return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
 
 
+def walled(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = MARGIN, most: float = OFF) -> Shelf:
+    """The shelf with walls that are moved inwards until `margin` [m] before them lies nothing that is measured of them,
+    where noise is so large that some of it lies behind them.
+
+    A wall is where most points are near its place; those behind it tell its noise. Else, as where things stand near a
+    wall that is not seen, it stays. So does the board: on it, not at the walls, stand things.
+
+    Args:
+      shelf: may be traced.
+      points: of an image [m]; NaN where nothing was measured.
+      margin: see above.
+      most: how far before a wall's place its points can end [m].
+    """
+    x, y, z = (points[..., i].reshape(-1) for i in range(3))
+    walls = shelf.walls
+    upright = (z > shelf.board + NEAR_WALL) & (z < shelf.ceiling - NEAR_WALL)
+    deep = upright & (x > shelf.front) & (x < shelf.back - NEAR_WALL)
+    wide = upright & (y > shelf.right + NEAR_WALL) & (y < shelf.left - NEAR_WALL)
+
+    def inwards(before, beside):
+        place = (jnp.arange(_BINS) + 0.5) * (2 * NEAR_WALL / _BINS) - NEAR_WALL
+        within = beside & (jnp.abs(before) < NEAR_WALL)
+        index = jnp.where(within, (before + NEAR_WALL) * (_BINS / (2 * NEAR_WALL)), 0.0).astype(jnp.int32)
+        count = jnp.zeros(_BINS).at[index].add(within * 1.0)
+        smooth = jnp.convolve(count, jnp.ones(5), mode="same")
+        densest = place[jnp.argmax(jnp.where(jnp.abs(place) <= OFF, smooth, -1.0))]
+        most_there = jnp.where(jnp.abs(place - densest) < 2.5e-3, count, 0.0)
+        at = jnp.sum(most_there * place) / jnp.maximum(jnp.sum(most_there), 1.0)
+        behind = count * (place <= at)
+        noise = jnp.sqrt(jnp.sum(behind * (place - at) ** 2) / jnp.maximum(jnp.sum(behind), 1.0))
+        total, end = jnp.sum(count), at + _DEVIATIONS * noise
+        on_it = jnp.sum(jnp.where(jnp.abs(place - at) <= _DEVIATIONS * noise + 1e-3, count, 0.0))
+        seen = (total >= _WALL_POINTS) & (on_it > _WALL_SHARE * total)
+        seen &= jnp.sum(jnp.where(place < -MARGIN / 2, count, 0.0)) > _BEHIND * total
+        return jnp.where(seen, jnp.clip(end, margin, jnp.maximum(margin, most)) - margin, 0.0)
+
+    return dataclasses.replace(
+        shelf,
+        back=shelf.back - inwards(walls.back - x, wide),
+        right=shelf.right + inwards(y - walls.right, deep),
+        left=shelf.left - inwards(walls.left - y, deep),
+    )
+
+
 def numbered(down: Bool[Array, "above w"], right: Bool[Array, "h before"]) -> Int[Array, "h w"]:
     """A number for each pixel, the same for connected pixels: that of one of them in the order of rows.
 
@@ -282,6 +334,32 @@ def surfaces(points: Float[Array, "h w 3"], standing: Bool[Array, "h w"]) -> Int
         return both[0] & both[1] & (step < _JUMP + jnp.minimum(jnp.maximum(before, after), _STEEPEST))
 
     return numbered(connected(0), connected(1))
+
+
+def high_in_opening(shelf: Shelf, points: Shaped[Any, "*batch 3"]) -> Bool[Any, "*batch"]:
+    """Whether points [m] are in the upper half of the shelf's opening, where the lip of the upper board hangs. A shelf
+    without a ceiling has no upper half."""
+    return (points[..., 2] > (shelf.board + shelf.walls.ceiling) / 2) & (points[..., 0] < shelf.front + LIP)
+
+
+def hanging(
+    shelf: Shelf, points: Float[Array, "h w 3"], standing: Bool[Array, "h w"], surface: Int[Array, "h w"]
+) -> Bool[Array, "h w"]:
+    """The pixels of surfaces that hang in the shelf's opening, such as the lip of the upper board: nothing stands
+    before the opening that could hide what they stand on.
+
+    Args:
+      shelf: in the image.
+      points: [m]; NaN where nothing was measured.
+      standing, surface: as of `surfaces`.
+    """
+    opening = standing & high_in_opening(shelf, points)
+    number = surface.reshape(-1)
+    pixels, there = (
+        jnp.zeros(number.size, jnp.int32).at[number].add(chosen.reshape(-1).astype(jnp.int32))
+        for chosen in (standing, opening)
+    )
+    return standing & (there > HANGING * pixels)[surface]
 
 
 def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:

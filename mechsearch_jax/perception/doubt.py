@@ -10,11 +10,22 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.images.cloud import OVERHANG, View, above_board, shelf_view, surfaces, thinned_view
+from mechsearch_jax.images.cloud import (
+    OVERHANG,
+    View,
+    above_board,
+    hanging,
+    high_in_opening,
+    shelf_view,
+    surfaces,
+    thinned_view,
+    walled,
+)
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.recogniser import Setting
 from mechsearch_jax.runtime.compiled import cached_jit
@@ -33,6 +44,8 @@ PIXELS = 20_000
 FEWEST_POINTS = 50
 # Points within this distance of the shelf's faces count as the shelf [m].
 FACES = 0.012
+# How far before its place a wall that is seen may be measured [m].
+WALLS = 0.02
 # A surface is lost if more than this share of its points is on nothing that is recognised.
 LOST = 0.6
 # Objects that fewer rays reach are ignored.
@@ -182,10 +195,10 @@ def recognition_doubt(
     origin, known = np.array(camera.position, float), measured(depths)
     judged = known[ends_in_shelf(shelf, origin, rays)]
     missing = 1.0 - float(judged.mean()) if len(judged) else 1.0
+    finite = known & np.isfinite(depths)
+    points = origin + np.where(finite, depths, np.nan)[:, None] * rays
+    points = points[_on_the_board(_walled(shelf, jnp.asarray(points, jnp.float32)), points)]
     rays, depths = rays[known], depths[known]
-    finite = np.isfinite(depths)
-    points = origin + depths[finite, None] * rays[finite]
-    points = points[_on_the_board(shelf, points)]
     things = things_of(shelf, setting.target, observation)
 
     gap = np.full(len(points), np.inf)
@@ -198,7 +211,8 @@ def recognition_doubt(
 
 
 def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndarray, "h w"]) -> tuple[str, ...]:
-    """A warning if surfaces on the shelf, large enough for an object, lie on nothing that is recognised.
+    """Warnings if surfaces on the shelf, large enough for an object, lie on nothing that is recognised, or hang in its
+    opening.
 
     Where nothing at all is recognised, `plausibility.sight_faults` says so.
 
@@ -213,31 +227,49 @@ def lost_faults(setting: Setting, observation: Observation, depth: Float[np.ndar
     if not things:
         return ()
     view = thinned_view(camera, shelf)
-    points, standing, number = (np.asarray(a) for a in _surfaces(view, shelf, view.of(jnp.asarray(depth, jnp.float32))))
-    points, number = points[standing], number[standing]
+    seen = _surfaces(view, shelf, view.of(jnp.asarray(depth, jnp.float32)))
+    points, standing, hangs, number = (np.asarray(a) for a in seen)
+    above = points[hangs]
+    points, number = points[standing & ~hangs], number[standing & ~hangs]
+    least = SAMPLED * found_pixels(camera)
+    faults = []
+    if len(above) * view.stride**2 > least:
+        faults.append(
+            f"depth image: something hangs in the shelf's opening down to z = {np.percentile(above[:, 2], 2):.3f} m "
+            "and is no object; if it belongs to the shelf, give that height as shelf.ceiling, lest the robot hit it"
+        )
     gap = np.full(len(points), np.inf)
     for thing in things:
         gap = np.minimum(gap, thing.gap(points))
     surface = np.unique(number, return_inverse=True)[1]
     pixels = np.bincount(surface) * view.stride**2
     off = np.bincount(surface, gap > DoubtConfig.tolerance) * view.stride**2
-    lost = np.flatnonzero((pixels > SAMPLED * found_pixels(camera)) & (off > LOST * pixels))
+    lost = np.flatnonzero((pixels > least) & (off > LOST * pixels))
     if not len(lost):
-        return ()
+        return tuple(faults)
     largest = lost[np.argmax(pixels[lost])]
     x, y, z = points[surface == largest].mean(axis=0)
     more = f", nor do {len(lost) - 1} others" if len(lost) > 1 else ""
     return (
+        *faults,
         f"recognition: what shows {pixels[largest]} pixels at ({x:.2f}, {y:.2f}, {z:.2f}) m does not lie on anything "
         f"that is recognised{more}",
     )
 
 
+@jax.jit
+def _walled(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Shelf:
+    return walled(shelf, points, FACES, WALLS)
+
+
 @cached_jit()
-def _surfaces(view: View, shelf: Shelf, depth: Array) -> tuple[Array, Array, Array]:
-    """Points of a view, which of them stand on the shelf, and the numbers of their surfaces."""
+def _surfaces(view: View, shelf: Shelf, depth: Array) -> tuple[Array, Array, Array, Array]:
+    """Points of a view, which of them are on the shelf and which hang in its opening, and the numbers of their
+    surfaces."""
     points = back_project(view.camera, jnp.where(measured(depth), depth, jnp.nan))
-    return points, above_board(shelf, points, FACES), surfaces(points, above_board(shelf, points))
+    standing = above_board(shelf, points)
+    number = surfaces(points, standing)
+    return points, above_board(_walled(shelf, points), points, FACES), hanging(shelf, points, standing, number), number
 
 
 def check_recognition(setting: Setting, observation: Observation, depth: Any, config: DoubtConfig) -> None:
@@ -269,7 +301,8 @@ def _on_the_board(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     x, y, z = points.T
     deep = (x > shelf.front - OVERHANG) & (x < shelf.back - FACES)
     wide = (y > shelf.right + FACES) & (y < shelf.left - FACES)
-    return deep & wide & (z > shelf.board + FACES) & (z < shelf.ceiling - FACES)
+    within = deep & wide & (z > shelf.board + FACES) & (z < shelf.ceiling - FACES)
+    return within & ~high_in_opening(shelf, points)
 
 
 def things_of(shelf: Shelf, target: Target, observation: Observation) -> list[Thing]:
