@@ -138,22 +138,43 @@ def test_what_lies_over_another_stands_on_it_and_what_is_behind_does_not():
     np.testing.assert_allclose(moved, np.asarray(heights) + 0.05, atol=0.002)
 
 
-def test_a_box_on_a_box_is_recognised_where_it_stands():
-    lower = Body("box", (0.07, 0.1, 0.03), (*MIDDLE, SHELF.board + 0.03), (1.0, 0.0, 0.0, 0.0))
-    upper = Body("box", (0.03, 0.05, 0.05), (*MIDDLE, SHELF.board + 0.11), (0.98, 0.0, 0.0, 0.2))
+def recognised(bodies):
+    """What is made of the true segments of an image of bodies, and the true bodies."""
     camera, directions = VIEW.camera, rays(VIEW.camera)
-    truth, origin = superquadrics([lower, upper]), jnp.array(camera.position)
-    depths = np.stack([object_depth(jax.tree.map(lambda a, i=i: a[i], truth), origin, directions) for i in range(2)])
+    truth, origin = superquadrics(bodies), jnp.array(camera.position)
+    each = [jax.tree.map(lambda a, i=i: a[i], truth) for i in range(len(bodies))]
+    depths = np.stack([object_depth(body, origin, directions) for body in each])
     board = (SHELF.board - camera.position[2]) / np.minimum(np.asarray(directions)[..., 2], -1e-6)
     depth = jnp.asarray(np.minimum(depths.min(axis=0), board), jnp.float32)
     points = back_project(camera, depth)
     owner = np.where(np.asarray(above_board(SHELF, points)), depths.argmin(axis=0), FREE).astype(np.int8)
     image = LabelledImage(points, depth, jnp.asarray(owner), jnp.zeros(depth.shape, bool))
     settings = ShapeNetwork.of(), camera, SHELF, Target.of("cylinder"), RefinementConfig()
-    seen = as_segmented(jax.random.split(jax.random.key(0)), image, *settings)
+    return as_segmented(jax.random.split(jax.random.key(0)), image, *settings), truth
+
+
+def test_a_box_on_a_box_is_recognised_where_it_stands():
+    lower = Body("box", (0.07, 0.1, 0.03), (*MIDDLE, SHELF.board + 0.03), (1.0, 0.0, 0.0, 0.0))
+    upper = Body("box", (0.03, 0.05, 0.05), (*MIDDLE, SHELF.board + 0.11), (0.98, 0.0, 0.0, 0.2))
+    seen, truth = recognised([lower, upper])
     assert np.asarray(seen.objects.valid).tolist() == [True, True] + [False] * (SLOTS - 2)
     # The upper one hides how deep the lower one is.
     np.testing.assert_allclose(seen.objects.position[:2], truth.position[:2], atol=0.02)
     np.testing.assert_allclose(seen.objects.position[1], truth.position[1], atol=0.006)
     np.testing.assert_allclose(seen.objects.size[1, 2], 0.05, atol=0.006)
     assert (np.asarray(seen.confidence)[:2] > 0.5).all()
+
+
+@pytest.mark.parametrize("lean", [0.25, 0.5])
+def test_a_leaning_book_is_recognised_as_it_leans(lean):
+    half, R = np.array([0.012, 0.09, 0.11]), Rotation.from_euler("y", lean).as_matrix()
+    place = (*MIDDLE, SHELF.board + float(np.abs(R[2]) @ half))
+    seen, _ = recognised([Body("box", tuple(half), place, (np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0))])
+    size, axes, at = (
+        np.asarray(a[0], float) for a in (seen.objects.size, seen.objects.rotation, seen.objects.position)
+    )
+    thin = np.argmin(size)
+    assert np.abs(axes[:, thin] @ R[:, 0]) > np.cos(np.radians(3))
+    np.testing.assert_allclose(np.sort(size), half, atol=0.012)
+    np.testing.assert_allclose(at, place, atol=0.012)
+    assert at[2] - np.abs(axes[2]) @ size > SHELF.board - 0.004
