@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, Appearance, observe
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.colour import RED, TargetColour, hue_difference, rgb_of_hue
-from mechsearch_jax.images.detection import ColouredDepth, densest_place, detect, no_detection
+from mechsearch_jax.images.detection import ColouredDepth, densest_place, detect, no_detection, without_strips
 from mechsearch_jax.images.noise import RandomDirection, depth_of
 from mechsearch_jax.images.target_pose import depth_tolerance
 from mechsearch_jax.runtime.errors import InputError
@@ -159,6 +160,33 @@ def test_the_tolerance_is_four_deviations_of_the_depths_noise():
     assert float(depth_tolerance(rough, jnp.ones((100, 100), bool))) == pytest.approx(0.0048, rel=0.05)
     assert float(depth_tolerance(jnp.full((5, 5), 0.7), jnp.ones((5, 5), bool))) == pytest.approx(0.003)
     assert float(depth_tolerance(depth, jnp.zeros((100, 100), bool))) == pytest.approx(0.008)
+
+
+def test_noise_that_neighbours_share_is_in_the_tolerance():
+    smooth = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(100, 100)), 3.0)
+    # Of 1 / z, as that of a stereo camera is, 2 mm; at six pixels it still is alike in part.
+    depth = 1.0 / (1.0 / 0.7 + 0.001 * np.arange(100.0)[:, None] + 0.002 / 0.7**2 * smooth / smooth.std())
+    everywhere, low = jnp.ones((100, 100), bool), jnp.zeros((100, 100), bool).at[40:46].set(True)
+    for chosen in (everywhere, low):
+        assert 0.0045 < float(depth_tolerance(jnp.asarray(depth, jnp.float32), chosen)) < 0.0075
+
+
+@pytest.mark.parametrize("gap", [0, 2])
+@pytest.mark.parametrize("turned", [False, True])
+def test_colours_at_the_edge_of_something_nearer_are_not_its_own(gap, turned):
+    """Colours that lie three pixels over the edge of what is nearer, one of whose pixels may not be measured."""
+    depth, chosen = np.full((40, 60), 0.8), np.zeros((40, 60), bool)
+    depth[:, 30:] = 0.6
+    depth[:, 33 : 33 + gap] = np.nan
+    chosen[5:35, 20:33] = True
+    wanted = chosen & (depth > 0.7)
+    if turned:
+        depth, chosen, wanted = depth.T, chosen.T, wanted.T
+    np.testing.assert_array_equal(without_strips(jnp.asarray(chosen), jnp.asarray(depth)), wanted)
+    # A thing of its own, however narrow, keeps its pixels.
+    alone = np.full(depth.shape, 0.8)
+    alone[chosen & ~wanted] = 0.6
+    np.testing.assert_array_equal(without_strips(jnp.asarray(chosen), jnp.asarray(alone)), chosen)
 
 
 def test_a_hue_and_a_tolerance_make_a_detector():

@@ -49,6 +49,8 @@ EQUAL = 0.03
 WINDOW = 5
 LIKE_DEPTH = 0.01
 LIKE_COLOUR = 0.25
+# Largest width of the strips along edges where a sensor's colours and depths do not match, in pixels of a view.
+STRIP = 4
 # Points within this distance of the fitted target's surface are on it [m]: four standard deviations of 1 mm noise.
 SURFACE = 0.004
 # Number of points that the densest place is chosen from, and that the target is fitted to.
@@ -108,7 +110,43 @@ def coloured_pixels(
       colour: red, green and blue in 0 to 1.
       depth: [m]; NaN where nothing was measured.
     """
-    return elected(detector(evened(colour, depth)), depth)
+    return without_strips(elected(detector(evened(colour, depth)), depth), depth)
+
+
+def without_strips(chosen: Bool[Array, "h w"], depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Chosen pixels without strips of up to `STRIP` pixels along the edges of surfaces that are else not chosen.
+
+    There a sensor sees what is nearer some pixels too wide, or its colours shifted: the pixels have the colour of what
+    is behind the edge, and the depth of what is before it. Next to what is not measured, a narrow strip may be of it.
+
+    Args:
+      chosen: the pixels.
+      depth: [m]; NaN where nothing was measured.
+    """
+    strips = jnp.zeros(chosen.shape, bool)
+    for there, picked, strip in ((depth, chosen, strips), (depth.T, chosen.T, strips.T)):
+        ends = [_steps_to(there, picked, by) for by in (1, -1)]
+        for (edge, _), (_, other) in (ends, ends[::-1]):
+            strip = strip | (edge + other <= STRIP + 1)
+        strips = strips | (strip if there is depth else strip.T)
+    return chosen & ~strips
+
+
+def _steps_to(depth: Array, chosen: Array, by: int) -> tuple[Array, Array]:
+    """How many pixels along rows, to the right (1) or left (-1), the measured surface ends, and something not chosen
+    begins that may belong to it; many where neither is within `STRIP`."""
+    width, many = depth.shape[1], jnp.full(depth.shape, 2 * STRIP)
+    edges = ((0, 0), (STRIP, STRIP))
+    depths, picks = jnp.pad(depth, edges, constant_values=math.nan), jnp.pad(chosen, edges)
+    edge, other, last, goes_on = many, many, depth, jnp.ones(depth.shape, bool)
+    for k in range(1, STRIP + 1):
+        near, picked = (a[:, STRIP + by * k :][:, :width] for a in (depths, picks))
+        gap, alike = jnp.isnan(near), jnp.abs(near - last) < LIKE_DEPTH
+        edge = jnp.where((edge == many) & ~alike, k, edge)
+        goes_on = goes_on & (gap | alike)
+        other = jnp.where((other == many) & goes_on & ~picked, k, other)
+        last = jnp.where(gap, last, near)
+    return edge, other
 
 
 def fitted_pose(

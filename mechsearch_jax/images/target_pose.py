@@ -28,6 +28,10 @@ LONGEST_STEP = (0.01, 0.01, 0.3)
 # Points within so many standard deviations of the depth's noise of the target's surface are on it, but not nearer or
 # farther than these distances [m].
 DEVIATIONS, LEAST_TOLERANCE, LARGEST_TOLERANCE = 4.0, 0.003, 0.008
+# So far apart are pixels whose noise is compared, in pixels of a view: 1.5 cm on a surface seen face on.
+APART = 6
+# Least number of these that noise is measured by.
+LEAST_APART = 30
 # Points of the target's colour up to this far from its surface belong to a larger thing, if they are not on it [m].
 BEYOND = 0.03
 # The target's outline is known to this distance, for its pose is not exact [m].
@@ -228,14 +232,32 @@ def within_shelf(target: Target, placement: Placement, shelf: Shelf) -> Bool[Arr
 def depth_tolerance(depth: Float[Array, "h w"], chosen: Bool[Array, "h w"]) -> Float[Array, ""]:
     """Distance from a surface within which points are on it [m], by the depth's noise in the chosen pixels.
 
-    The noise is the median size of the second differences along rows, which surfaces hardly have.
+    The noise is the median size of the second differences along rows, which surfaces hardly have, or of those of the
+    inverse depth of pixels `APART` along columns, where that is larger. Noise that neighbours share shows only in the
+    latter, which planes and upright surfaces do not have; where the chosen pixels are too low, it is the image's.
     """
-    second = depth[:, 2:] - 2.0 * depth[:, 1:-1] + depth[:, :-2]
-    size = jnp.where(chosen[:, 1:-1] & jnp.isfinite(second), jnp.abs(second), jnp.nan)
     # Half of all normal numbers of deviation 1 are below 0.6745; second differences have 6 times the variance.
-    deviation = jnp.nanmedian(size) / (0.6745 * math.sqrt(6.0))
-    tolerance = jnp.clip(DEVIATIONS * deviation, LEAST_TOLERANCE, LARGEST_TOLERANCE)
+    usual = 0.6745 * math.sqrt(6.0)
+    second = depth[:, 2:] - 2.0 * depth[:, 1:-1] + depth[:, :-2]
+    own = _median_size(jnp.where(chosen[:, 1:-1], second, jnp.nan)) / usual
+    inverse = 1.0 / jnp.where(jnp.isfinite(depth), depth, jnp.nan)
+    there = _apart(jnp.where(chosen, inverse, jnp.nan))
+    few = jnp.sum(jnp.isfinite(there)) < LEAST_APART
+    mean = jnp.nanmean(jnp.where(chosen, inverse, jnp.nan))
+    shared = _median_size(jnp.where(few, _apart(inverse), there)) / mean**2 / usual
+    tolerance = jnp.clip(DEVIATIONS * jnp.fmax(own, shared), LEAST_TOLERANCE, LARGEST_TOLERANCE)
     return jnp.where(jnp.isnan(tolerance), LARGEST_TOLERANCE, tolerance)
+
+
+def _apart(values: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Second differences along columns, NaN where the image ends."""
+    padded = jnp.pad(values, ((APART, APART), (0, 0)), constant_values=math.nan)
+    return padded[2 * APART :] - 2.0 * values + padded[: -2 * APART]
+
+
+def _median_size(values: Float[Array, "h w"]) -> Float[Array, ""]:
+    """Of the finite ones; NaN if there are none."""
+    return jnp.nanmedian(jnp.where(jnp.isfinite(values), jnp.abs(values), jnp.nan))
 
 
 def upright_placements(
