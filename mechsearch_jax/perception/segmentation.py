@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.masked import masked_vmap
-from mechsearch_jax.images.cloud import above_board, cloud_of, hanging, middle, resample, surfaces, walled
+from mechsearch_jax.images.cloud import above_board, cloud_of, hanging, middle, resample, surfaces
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
@@ -168,7 +168,7 @@ class NetworkSegmenter(PyTreeNode):
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
         from mechsearch_jax.networks.segmentation import apply_network
 
-        objects = above_board(walled(shelf, points), points) & ~of_target
+        objects = above_board(shelf, points) & ~of_target
         surface = surfaces(points, objects)
         objects &= ~hanging(shelf, points, objects, surface)
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface.reshape(-1))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.images.cloud import above_board, draw, walled
+from mechsearch_jax.images.cloud import above_board, draw
 from mechsearch_jax.images.labels import OTHER
 from mechsearch_jax.perception.hypotheses import SLOTS, WAYS
 from mechsearch_jax.perception.recognition import LabelledImage
@@ -109,7 +109,7 @@ def sample_of(
     key: Array, image: LabelledImage, base: Superquadrics, camera: Camera, shelf: Shelf, costs: Costs
 ) -> Sample:
     """Points and rays of an image; `base` are the objects of its segments."""
-    judged = above_board(walled(shelf, image.points, costs.faces), image.points, costs.faces) & ~image.of_target
+    judged = above_board(shelf, image.points, costs.faces) & ~image.of_target
     # What belongs to no segment speaks for no object.
     index, total = draw(key, ((image.labels >= 0) & judged).reshape(-1), costs.points)
     height, width = image.labels.shape
