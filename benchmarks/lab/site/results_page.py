@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.preset_names import FROM_THE_FRONT, WITHIN_45, Settings, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import WITHIN_45, Settings, settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
@@ -28,7 +28,7 @@ Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
 # Of today's default, and of the former ones. Fields of the page are named after them.
-RUNS = ("report-i-h200", "table1-narrow-sides-h200", "report-h-whole-h200", "collision-free-h200")
+RUNS = ("report-i-h200", "table1-narrow-sides-h200", "report-h-whole-h200")
 # The default before, in the run of today's first one.
 BEFORE = "report-i-before-h200"
 # Of the default before, on scenes that it was chosen on.
@@ -171,13 +171,12 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
-# Figures of `bench real` on the page; those of single kinds of scene are of the first two.
+# Figures of `bench real` on the page.
 REAL = ("matched", "matched well", "split", "phantoms", "90th percentile, mm", "rays through, %", "stand raised")
-OF_KINDS = 2
 
 
 def real_images(stored: Stored) -> str:
-    """The table of what `bench real` measures on tables, each kind of them, and a shelf."""
+    """The table of what `bench real` measures on tables and a shelf."""
 
     def cell(figures: Mapping[str, Any], name: str) -> str:
         entry = figures.get(name, {})
@@ -186,14 +185,19 @@ def real_images(stored: Stored) -> str:
         low, high = entry["interval"]
         return f"{entry['value']:.2f} ({low:.2f} to {high:.2f})"
 
-    lines = []
-    for file, place in (("real-tables-cpu", "tables"), ("real-shelf-cpu", "a shelf")):
-        for images, groups in stored[file]["figures"].items():
-            for group, figures in groups.items():
-                names = REAL if group == "all" else REAL[:OF_KINDS]
-                cells = [cell(figures, name) if name in names else "" for name in REAL]
-                lines.append([place if group == "all" else f"{place}: {group}", images, *cells])
+    lines = [
+        [place, images, *(cell(groups["all"], name) for name in REAL)]
+        for file, place in (("real-tables-cpu", "tables"), ("real-shelf-cpu", "a shelf"))
+        for images, groups in stored[file]["figures"].items()
+    ]
     return table(["images", "seen from", *REAL], lines)
+
+
+def real_kinds(stored: Stored) -> str:
+    """How many things of each kind of table are matched, from depth and colour."""
+    groups = stored["real-tables-cpu"]["figures"]["depth and colour"]
+    kinds = {kind: figures["matched"]["value"] for kind, figures in groups.items() if kind != "all"}
+    return ", ".join(f"{kind} {value:.2f}" for kind, value in kinds.items())
 
 
 def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[EpisodeRow]:
@@ -225,18 +229,14 @@ def _change(after: Sequence[EpisodeRow], before: Sequence[EpisodeRow]) -> dict[s
     }
 
 
-def default_rates(
-    today: StoredRun, table1: StoredRun, before: StoredRun, collision_free: StoredRun, *, beside: StoredRun
-) -> dict[str, Any]:
+def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, *, beside: StoredRun) -> dict[str, Any]:
     """The fields of the template about what the default and the one before reach, with true shapes and from images;
     `beside` is of the one before, in the run of today's."""
     masks, full = {"recognition": "masks"}, {"recognition": "full"}
     new, new_full = _on_new_scenes(today), _on_new_scenes(today, **full)
     old, old_full = _on_new_scenes(before, WITHIN_45), _on_new_scenes(before, WITHIN_45, **full)
-    front_grasps = _on_new_scenes(collision_free, FROM_THE_FRONT, **masks, retrieval_contact=False)
-    default = {**_named("`report-i`", new), **_named("before: `report-h`", old)}
+    default = _named("`report-i`", new)
     seen = _named("`full`, `report-i`", new_full)
-    free = _named("until 2026-11-28: `masks`, `c2`, collision-free grasps only", front_grasps)
     return {
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps({**default, **seen}),
@@ -244,8 +244,6 @@ def default_rates(
             "recognition",
             {
                 **_named("before: `masks`, `c2`", _on_new_scenes(table1, WITHIN_45, **masks)),
-                **free,
-                **_named("before: `full`, `c2`", _on_new_scenes(table1, WITHIN_45, **full)),
                 **seen,
             },
         ),
@@ -274,6 +272,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "pushes": pushes(stored),
         "perception": perception(stored),
         "real": real_images(stored),
+        "real_kinds": real_kinds(stored),
         "batch_decision": 1000 * sum(row.planning_seconds for row in batch.rows) / sum(row.steps for row in batch.rows),
         "at_once": planned["shapes"]["batch"] / planned["median_seconds"],
         "batch_ready": clock["all compiled [s]"],
