@@ -175,7 +175,7 @@ def bench_confidence(*, scenes: int = 250) -> None:
     groups = {"all": judged, "usual shelf": judged[judged.usual], "others": judged[~judged.usual]}
     groups |= {sensor: judged[judged.sensor == sensor] for sensor in sorted(set(judged.sensor))}
     for kind in ("confidence", "fitted"):
-        for line in confidences.reliability(judged[kind].to_numpy(), judged.right.to_numpy()):
+        for line in confidences.reliability(np.asarray(judged[kind]), np.asarray(judged.right)):
             table.add_row(kind, *(f"{line[name]:.2f}" if name != "objects" else str(line[name]) for name in line))
         for name, group in groups.items():
             sure = group[group[kind] >= SURE]

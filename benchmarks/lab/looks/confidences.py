@@ -74,7 +74,7 @@ def looked_at(scenes: int, report: Callable[[int], None] = lambda done: None) ->
         scene, seen, fitted = jax.device_get(_look(core, jax.random.fold_in(first, _FIRST + number)))
         usual = abs(scene.shelf.back - scene.shelf.front - (Shelf().back - Shelf().front)) < 1e-6
         about = np.asarray(logarithms(fitted.measures))
-        for slot in np.flatnonzero(fitted.objects.valid):
+        for slot in np.flatnonzero(fitted.objects.valid).tolist():
             stated = {"confidence": float(fitted.confidence[slot]), "logarithms": about[slot], "usual": bool(usual)}
             right = _is_right(scene, seen.labels[fitted.labels == slot], fitted, slot)
             rows.append({"scene": number, "sensor": names[int(seen.sensor)], **stated, "right": right})
@@ -89,10 +89,14 @@ def _is_right(scene: Scene, shown: np.ndarray, fitted: Fitted, slot: int) -> boo
         return False
     i, world, objects = int(np.bincount(things).argmax()), scene.world, fitted.objects
     is_round = bool(by_shape(world.kind[i], lambda shape: shape.round, np))
-    truth = Thing("", world.half_size[i], is_round, world.rotation[i], world.position[i])
+    truth = _thing(world.half_size[i], is_round, world.rotation[i], world.position[i])
     is_round = bool(objects.exponents[slot, 1] > 0.5)
-    answer = Thing("", objects.size[slot], is_round, objects.rotation[slot], objects.position[slot])
+    answer = _thing(objects.size[slot], is_round, objects.rotation[slot], objects.position[slot])
     return bool(np.linalg.norm(truth.position - answer.position) < CENTRE and turned_by(truth, answer) < ANGLE)
+
+
+def _thing(size: Array, is_round: bool, rotation: Array, position: Array) -> Thing:
+    return Thing("", np.asarray(size), is_round, np.asarray(rotation), np.asarray(position))
 
 
 def constants(about: Float[np.ndarray, "n 3"], right: np.ndarray) -> Float[np.ndarray, " 4"]:

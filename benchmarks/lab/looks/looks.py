@@ -136,9 +136,12 @@ class MeasuredLooks:
         for segments, noise in dict.fromkeys((row.segments, row.noise) for row in self.rows):
             kind = (segments, noise)
             stated = [
-                (row.confidence, not (row.centre < CENTRE and row.angle < ANGLE))
+                (
+                    row.confidence,
+                    row.centre is None or row.angle is None or max(row.centre / CENTRE, row.angle / ANGLE) >= 1,
+                )
                 for row in self.rows
-                if (row.segments, row.noise) == kind and None not in (row.confidence, row.centre, row.angle)
+                if (row.segments, row.noise) == kind and row.confidence is not None
             ]
             stated += [(p.confidence, True) for p in self.phantoms if (p.segments, p.noise) == kind]
             for low, high in itertools.pairwise(CONFIDENCES):
