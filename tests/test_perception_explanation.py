@@ -206,7 +206,7 @@ def test_confidence_falls_with_what_is_measured():
     rows = [sure, *({**sure, name: value} for name, value in worse.items())]
     measures = Measures(**{name: jnp.array([row[name] for row in rows]) for name in sure})
     best, *others = np.asarray(confidence_of(measures)).tolist()
-    assert 0.99 < best < 1.0
+    assert 0.95 < best < 1.0
     assert all(other < best for other in others)
     assert others[-1] == 0.0
 

@@ -82,6 +82,7 @@ IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
         "calibration",
         "ceiling",
         "cell",
+        "confidence",
         "detection",
         "looks",
         "push",

@@ -197,7 +197,8 @@ def recognition_doubt(
     missing = 1.0 - float(judged.mean()) if len(judged) else 1.0
     finite = known & np.isfinite(depths)
     points = origin + np.where(finite, depths, np.nan)[:, None] * rays
-    points = points[_on_the_board(_walled(shelf, jnp.asarray(points, jnp.float32)), points)]
+    before_walls = jax.tree.map(np.asarray, _walled(shelf, jnp.asarray(points, jnp.float32)))
+    points = points[_on_the_board(before_walls, points)]
     rays, depths = rays[known], depths[known]
     things = things_of(shelf, setting.target, observation)
 
