@@ -140,7 +140,9 @@ def test_specks_of_the_targets_colour_are_unclear():
     assert 10 < np.sum(owner == TARGET) < 25
     assert not found.visible
     assert not found.pixels.any()
-    np.testing.assert_array_equal(found.unclear, owner == TARGET)
+    # A strip along the pillar's edge may be of the pillar.
+    assert not (found.unclear & (owner != TARGET)).any()
+    assert np.sum(found.unclear) > 0.9 * np.sum(owner == TARGET)
 
 
 def test_the_densest_place_is_on_the_largest_thing():

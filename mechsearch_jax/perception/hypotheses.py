@@ -175,8 +175,9 @@ def fitted(
 
     seeds = jax.random.bits(key, (masks.shape[0],), jnp.uint32)
     shared, element = (shapes.parameters, camera, shelf), (image.points, image.depth, image.labels)
-    # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more.
-    block = 1 if on_cpu() else SLOTS
+    # On a CPU, the network and the refinement are the faster the fewer segments they get at once; on a GPU, the more,
+    # up to the few that a batch of images still has in the second turn.
+    block = 1 if on_cpu() else 2
     fits = masked_vmap(fit, active, shared, element, (masks, boards, seeds), block=block)
     objects = fits.objects.replace(
         valid=fits.objects.valid & active, size=jnp.where(active[:, None], fits.objects.size, 0.01)
@@ -217,7 +218,7 @@ def mended(
 
     doubtful = fits.objects.valid & ~(fits.misfit < DOUBTFUL)
     element = (image.points, image.depth, image.labels)
-    rough = masked_vmap(fit, doubtful, (camera, shelf), element, (masks, boards), block=1 if on_cpu() else SLOTS)
+    rough = masked_vmap(fit, doubtful, (camera, shelf), element, (masks, boards), block=1)
     better = doubtful & rough.objects.valid & (rough.misfit < BETTER * fits.misfit)
     return jax.tree.map(functools.partial(rows_where, better), rough, fits)
 
