@@ -39,8 +39,11 @@ def test_a_file_says_workcell_and_planner(file):
     settings = load_settings(file)
     searcher = cell.load_searcher(file, keep=False)
     assert searcher.workcell == settings.workcell
-    assert searcher.config == settings.config
-    expected = Method(config=settings.config, workcell=settings.workcell).policy()
+    # A robot touches nothing beside what is to be moved, unless the file says that it may.
+    config = settings.config.with_options(retrieval_contact=False)
+    assert searcher.config == config
+    assert cell.load_searcher(file, keep=False, retrieval_contact=True).config == settings.config
+    expected = Method(config=config, workcell=settings.workcell).policy()
     policy = searcher._policy
     assert policy.config == expected.config
     assert policy.tries
@@ -60,7 +63,7 @@ def test_what_is_given_goes_before_the_file(file):
 
 
 def test_without_a_file_all_is_as_by_default():
-    assert cell.load_searcher(keep=False).config == Settings().config
+    assert cell.load_searcher(keep=False).config == Settings().config.with_options(retrieval_contact=False)
 
 
 def test_compilations_are_kept(file, tmp_path, monkeypatch):

@@ -37,7 +37,7 @@ from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
-from mechsearch_jax.planner.step import DRAWS
+from mechsearch_jax.planner.step import DRAWS, SearchState
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.hand import HandConfig
@@ -74,6 +74,11 @@ def searcher_of(problem, scenario, policy=grab, **arguments):
     searcher = Searcher(policy=policy, **{"recogniser": lambda problem: lambda *images: observation, **given})
     searcher.problem = problem
     return searcher
+
+
+def now(searcher):
+    """What a searcher knows."""
+    return SearchState(searcher.belief, searcher._now.observation, searcher._now.action)
 
 
 def turned(camera, by):
@@ -121,7 +126,7 @@ def test_nothing_is_over_before_it_was_handed_out(problem):
     searcher.next(IMAGES.depth)
     searcher.acted(ok=False)
     with pytest.raises(InputError, match="call next first"):
-        searcher.acted()
+        searcher.acted(ok=False)
 
 
 def test_a_motion_out_of_reach_is_none_and_says_so(problem):
@@ -293,8 +298,10 @@ def test_an_option_that_would_have_no_effect_is_refused():
 def test_what_a_configuration_names_is_what_decides_by_default():
     method = Method()
     searcher = Searcher()
-    assert searcher.config == method.config
-    assert (searcher._policy, searcher._trials) == (method.policy(), method.trials())
+    # A robot touches nothing beside what is to be moved.
+    quiet = dataclasses.replace(method, config=method.config.with_options(retrieval_contact=False))
+    assert searcher.config == quiet.config
+    assert (searcher._policy, searcher._trials) == (quiet.policy(), quiet.trials())
     assert isinstance(Searcher(config=standard(trials="learning"))._trials, LearningTrials)
     physics = Searcher(config=standard(trials="none", push_model="physics"))
     assert physics._trials is None
@@ -322,19 +329,19 @@ def test_where_nothing_is_tried_out_it_says_so(problem):
     # A user's policy may try actions by itself.
     assert searcher_of(problem, OPEN).check().notices == ()
     done = Motion("retrieve", "it is found", object())
-    assert plain._within_limit(done).reason == "it is found; not tried out before"
-    assert bold._within_limit(done).reason == "it is found"
+    assert plain._within_limit(done, now(plain)).reason == "it is found; not tried out before"
+    assert bold._within_limit(done, now(bold)).reason == "it is found"
 
 
 def test_after_all_actions_only_the_target_is_taken_out(problem):
     searcher = searcher_of(problem, OPEN, config=standard(max_steps=1))
     push, take = Motion("push", "to push object 1", object()), Motion("retrieve", "to take it", object())
-    assert searcher._within_limit(push) == push
+    assert searcher._within_limit(push, now(searcher)) == push
     searcher._state = dataclasses.replace(searcher._now, index=1)
-    kept = searcher._within_limit(push)
+    kept = searcher._within_limit(push, now(searcher))
     assert (kept.kind, kept.trajectory) == ("none", None)
     assert kept.reason.startswith("to push object 1; not done: all 1 actions of max_steps are used up")
-    assert searcher._within_limit(take) == take
+    assert searcher._within_limit(take, now(searcher)) == take
 
 
 def test_a_step_is_written_as_json(problem):

@@ -43,8 +43,9 @@ def load_searcher(
 ) -> Searcher:
     """A `Searcher` with the workcell and all planner options of a configuration file.
 
-    It plans as `mechsearch search` does with that file, including its push model, trials and `max_steps`. Compiled
-    functions and the problem are kept on disk, so that the next process starts in seconds.
+    It plans as `mechsearch search` does with that file, including its push model, trials and `max_steps`, but takes the
+    target out without touching other objects unless `retrieval_contact` is given. Compiled functions and the problem
+    are kept on disk, so that the next process starts in seconds.
 
     Args:
       path: of the file; all defaults if None.
@@ -83,7 +84,7 @@ def searcher_of(
     policy: str = "search-for-grasp",
     **arguments: Any,
 ) -> Searcher:
-    """A `Searcher` of settings.
+    """A `Searcher` of settings, without retrievals that touch other objects if `retrieval_contact` is not given.
 
     Args:
       settings: of a configuration file.
@@ -98,5 +99,7 @@ def searcher_of(
         workcell = dataclasses.replace(workcell, camera=camera)
     if arm is not None:
         workcell = workcell.with_arm(arm)
-    method = Method(policy, settings.config, workcell=workcell)
-    return Searcher(workcell, settings.config, policy=method.policy(), trials=method.trials(), **arguments)
+    # A robot touches nothing on purpose that is not to be moved, unless it is said that it may.
+    config = settings.with_options(**{"retrieval_contact": False, **settings.given}).config
+    method = Method(policy, config, workcell=workcell)
+    return Searcher(workcell, config, policy=method.policy(), trials=method.trials(), **arguments)

@@ -126,10 +126,15 @@ def grip_for(problem: Setting, observation: Observation | None, action: Action) 
     if what.seen and compound is not None and not (kind.holds_object and i < objects.capacity):
         T_target_gripper = np.linalg.inv(what.T_world_object) @ np.asarray(action.T_world_gripper, float)
         return grip_of_any_yaw((*grip_between(compound, T_target_gripper, opening), 0.0), opening)
-    if what.seen:
-        return grip_of(closing, what.T_world_object[:3, :3], np.array(what.size), np.array(what.exponents), opening)
     x, y, _ = what.size
-    return grip_of_any_yaw((x, y, 0.0), opening)
+    any_yaw = grip_of_any_yaw((x, y, 0.0), opening)
+    if not what.seen:
+        return any_yaw
+    seen = grip_of(closing, what.T_world_object[:3, :3], np.array(what.size), np.array(what.exponents), opening)
+    if (kind.holds_object and i < objects.capacity) or problem.target.round:
+        return seen
+    # From one side, a target's yaw and one a quarter of a turn from it may fit equally well.
+    return Grip(min(seen.low, any_yaw.low), max(seen.high, any_yaw.high))
 
 
 @cached_jit(static_argnames=("kind", "config"), on_host=True)

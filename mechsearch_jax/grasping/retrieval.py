@@ -235,6 +235,22 @@ def found_hits(
     return hits if previous is None or moved is None else jnp.where(moved[None], hits, previous)
 
 
+@jax.jit
+def retrieval_hits(grasps: TargetGrasps, found: FoundGrasps, scene: Superquadrics, action: Action) -> Bool[Array, " n"]:
+    """Which objects a retrieval hits on its whole way, shape (N,).
+
+    Args:
+      grasps: the grasps, one of which the retrieval makes.
+      found: their feasibility for the found target.
+      scene: the objects, without the target.
+      action: the retrieval.
+    """
+    T = compose(found.T_world_target[None], grasps.tables.T_target_gripper)
+    apart = jnp.sum((T - action.T_world_gripper[None]) ** 2, axis=(1, 2)) + (grasps.tables.q7 - action.q7) ** 2
+    chosen = jnp.arange(len(apart)) == jnp.argmin(apart)
+    return jnp.any(found_hits(grasps, found.replace(feasible=chosen), scene), axis=0)
+
+
 def crossing_hits(
     tables: GraspTables,
     gripper: Gripper,

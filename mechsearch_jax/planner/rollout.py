@@ -311,3 +311,10 @@ def no_sequences(config: PlannerConfig, objects: Superquadrics) -> Sequences:
         length=jnp.ones(count, jnp.int32),
         after=repeated(objects, count),
     )
+
+
+def no_decision(objects: Superquadrics) -> Decision:
+    """The decision to do nothing, for which nothing was considered."""
+    nothing = no_sequences(PlannerConfig(horizon=1, sequences=1), objects)
+    unknown = jnp.float32(jnp.nan)
+    return Decision(no_action(), jnp.float32(jnp.inf), unknown, unknown, objects, nothing)

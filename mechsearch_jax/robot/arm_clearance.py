@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import RobotPart, fingers, hand_parts, link_parts
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Edge of the cells into which boxes are divided, with a sphere around each [m]. Coarse cells are for self-collisions,
@@ -31,6 +32,8 @@ BLOCK = 64
 # The foot of the robot, which no primitive covers: a capsule about the axis of joint 1 [m].
 FOOT = ((0.0, 0.0, 0.06), (0.0, 0.0, 0.333), 0.08)
 HAND_FRAME = 7
+# In an image, what is this near to the arm may be the arm: the primitives' error and the camera's [m].
+AROUND = 0.02
 
 
 class Spheres(NamedTuple):
@@ -153,7 +156,7 @@ def tip_positions(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 3"]:
 
 def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clearance:
     frames = link_poses(q)
-    centres, radius = _placed(body.fine, frames), body.fine.radius
+    centres, radius = placed(body.fine, frames), body.fine.radius
     # The foot and links 1 and 2 stand on the floor.
     to_floor = (centres[..., 2] - radius - obstacles.floor)[:, body.fine.frame >= 2]
     free = np.minimum(to_floor.min(axis=1), FARTHEST)
@@ -164,13 +167,13 @@ def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clea
     return Clearance(free.astype(float), inside.astype(float))
 
 
-def _placed(spheres: Spheres, frames: np.ndarray) -> np.ndarray:
+def placed(spheres: Spheres, frames: np.ndarray) -> np.ndarray:
     """Centres of spheres in the base frame, shape (m, n, 3)."""
-    placed = []
+    parts = []
     for frame in np.unique(spheres.frame):
         local = spheres.centre[spheres.frame == frame]
-        placed.append(local @ np.swapaxes(frames[:, frame, :3, :3], 1, 2) + frames[:, frame, None, :3, 3])
-    return np.concatenate(placed, axis=1)
+        parts.append(local @ np.swapaxes(frames[:, frame, :3, :3], 1, 2) + frames[:, frame, None, :3, 3])
+    return np.concatenate(parts, axis=1)
 
 
 def _shelf_clearance(shelf: Shelf, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -207,7 +210,7 @@ def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.nda
 
 def _self_distance(coarse: Spheres, frames: np.ndarray) -> np.ndarray:
     """Distance of the wrist, the hand and the held object from the foot and links 1 and 2."""
-    points = _placed(coarse, frames)
+    points = placed(coarse, frames)
     least = np.full(len(frames), np.inf)
     for frame, start, end, radius in _base_capsules():
         T = frames[:, frame] if frame >= 0 else np.broadcast_to(np.eye(4, dtype=np.float32), (len(frames), 4, 4))
@@ -269,3 +272,36 @@ def _cover(kind: str, size: tuple[float, ...], cell: float) -> tuple[np.ndarray,
     axes = [(np.arange(n) - (n - 1) / 2) * step for n, step in zip(counts, steps, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return grid, float(np.linalg.norm(steps)) / 2
+
+
+def shows_arm(
+    camera: Camera, depth: Float[np.ndarray, "h w"], body: ArmBody, q: Float[np.ndarray, " 7"]
+) -> Bool[np.ndarray, "h w"]:
+    """Which pixels of a depth image show the arm, or something up to `AROUND` beside it.
+
+    Args:
+      camera: of the image.
+      depth: along the camera's axis [m]; other numbers than positive ones are not measured.
+      body: the arm.
+      q: its joint angles [rad].
+    """
+    frames, shown = link_poses(q[None]), np.zeros(depth.shape, bool)
+    turn, radius = np.array(camera.rotation), body.fine.radius + AROUND
+    centres = (placed(body.fine, frames)[0] - np.array(camera.position)) @ turn
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]) - 0.5
+    for centre, reach in zip(centres, radius, strict=True):
+        if centre[2] <= reach:
+            continue
+        # A little more than the image of the sphere.
+        half = focal * reach / (centre[2] - reach) * (1.0 + np.linalg.norm(centre[:2]) / centre[2])
+        pixel = focal * centre[:2] / centre[2] + middle
+        low, high = np.floor(pixel - half).astype(int), np.ceil(pixel + half).astype(int) + 1
+        (left, top), (right, bottom) = np.maximum(low, 0), np.minimum(high, (depth.shape[1], depth.shape[0]))
+        if left >= right or top >= bottom:
+            continue
+        z = depth[top:bottom, left:right]
+        x = (np.arange(left, right) - middle[0])[None] / camera.fx * z - centre[0]
+        y = (np.arange(top, bottom) - middle[1])[:, None] / camera.fy * z - centre[1]
+        with np.errstate(invalid="ignore"):
+            shown[top:bottom, left:right] |= x**2 + y**2 + (z - centre[2]) ** 2 < reach**2
+    return shown

@@ -158,11 +158,11 @@ def free_motion(
         waits = np.repeat(start[None], math.ceil(least / timestep - 1e-9), axis=0)
         return FreeMotion(waits, float(clearance(body, obstacles, start[None]).free[0]), True)
     space = _space(path, body, obstacles, config)
-    rows = timed_rows(_respaced(path, WAYPOINTS), timestep, pace, least, arm)
+    rows = timed_rows(respaced(path, WAYPOINTS), timestep, pace, least, arm)
     if not straight and not space.allowed(_thinned(rows, config.step)).all():
         # The smooth curve cuts a corner and touches something: stop at each corner.
         pieces = [
-            timed_rows(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0, arm)
+            timed_rows(respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0, arm)
             for pair in itertools.pairwise(path)
         ]
         rows = np.concatenate(pieces)
@@ -301,7 +301,7 @@ def _at(path: np.ndarray, lengths: np.ndarray, place: float) -> np.ndarray:
     return np.array([np.interp(place, lengths, path[:, k]) for k in range(path.shape[1])])
 
 
-def _respaced(path: np.ndarray, count: int) -> np.ndarray:
+def respaced(path: np.ndarray, count: int) -> np.ndarray:
     """Evenly spaced configurations on a path, its ends included."""
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * REACH, axis=1))])
     return np.array([_at(path, lengths, place) for place in np.linspace(0.0, lengths[-1], count)])

@@ -21,12 +21,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief
-from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.belief.impasse import hindrance, impasse
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
@@ -35,11 +35,13 @@ from mechsearch_jax.perception.plausibility import EMPTY_SHELF, sight_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.learning import LearnedFriction, restored
 from mechsearch_jax.planner.policies import Policy
+from mechsearch_jax.planner.rollout import no_decision
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.step import Decided, SearchState, believe, decide, unsearched
-from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.planner.trials import Trials, nothing_tried
 from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.robot.arm_clearance import ArmBody, shows_arm
 from mechsearch_jax.robot.arm_config import check_joints
 from mechsearch_jax.robot.hand import checked_width
 from mechsearch_jax.robot.motion import motion_with
@@ -52,13 +54,20 @@ from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_noth
 from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import Motion, Present, SearchStep, View, display_image, motion_of
-from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, way_out
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.sight import check_camera
 
 # Reachable share of the candidate poses below which `check` warns.
 LEAST_REACH = 0.5
 # Names of the kinds of action that leave the target on the shelf.
 KEEPS_TARGET = frozenset(kind.name for kind in KINDS.values() if not kind.takes_target and kind.code != ActionKind.NONE)
+# A motion was handed out, and its end was not reported.
+UNREPORTED = (
+    "the last motion was not reported: it counts as not made; if it was made, or begun, call acted before the next look"
+)
+# Fingers this near to each other, or to where they opened, hold nothing [m].
+EMPTY = 0.004
 # What `warm_up` compiles, in this order.
 STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "the motion")
 
@@ -99,8 +108,8 @@ class Searcher:
 
         Args:
           workcell: camera, shelf, gripper and target; the defaults if left out.
-          config: of the problem and the planner, and the largest number of actions; preset `standard` if left out.
-            `envs.cell.loading.load_searcher` reads it from a file.
+          config: of the problem and the planner, and the largest number of actions; if left out, preset `standard`
+            without retrievals that touch other objects. `envs.cell.loading.load_searcher` reads it from a file.
           seed: of all random numbers.
           policy: decides; by default search-for-grasp with `config.planner`. A policy brings its own planner
             configuration and push models.
@@ -121,7 +130,7 @@ class Searcher:
         """
         self.workcell = workcell or Workcell()
         check_camera(self.workcell.camera, self.workcell.shelf)
-        self.config = config or standard()
+        self.config = config or standard().with_options(retrieval_contact=False)
         self._seed = seed
         self._policy, self._trials = policy_and_trials(
             self.config, self.workcell.shelf, policy, trials, push_model, later_push_model
@@ -264,7 +273,8 @@ class Searcher:
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), the number of the object that a pixel shows; see `Recogniser`.
           target_id: the target's number in the mask; negative where the mask does not show it.
-          joints: where the arm is, seven angles [rad]; at home if left out.
+          joints: where the arm is, seven angles [rad]; if left out, where `acted` was told that it stopped, or at home.
+            What the image shows of the arm there counts as not measured.
           width: present distance between the fingers [m]; if left out, they are taken to be open.
 
         Returns:
@@ -281,7 +291,11 @@ class Searcher:
         keys = jax.random.split(jax.random.key(self._seed))
         decision_key, recognition_key = (jax.random.fold_in(key, now.index) for key in keys)
         images, present = converted(depth, colour, mask, target_id), self._present(joints, width)
+        if present.joints is not None:
+            images = images._replace(depth=self._without_arm(images.depth, present.joints))
         observation, warnings, unseen = self._seen(recognition_key, images)
+        if now.handed:
+            warnings.append(UNREPORTED)
         before = SearchState(now.belief, now.observation, now.action)
         if not now.acted:
             before = before.replace(observation=observation, action=no_action())
@@ -289,7 +303,13 @@ class Searcher:
         warnings += faults.belief_warnings(now.belief, state.belief, shelf_is_empty=EMPTY_SHELF in unseen)
         learned = self._learned(before, observation)
         trials = self._trials if learned is None else learned.trials([0])
-        decided, motion = self._decide(decision_key, trials, state, images.depth, unseen, present)
+        held = self._held(present)
+        first = held or self._way_out(observation, present)
+        if first is None:
+            decided, motion = self._decide(decision_key, trials, state, images.depth, unseen, present)
+        else:
+            decided, motion = Decided(no_decision(observation.objects), nothing_tried()), first
+        warnings += motion.warnings
         if motion.trajectory is not None and motion.trajectory.place_fault:
             warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
@@ -304,7 +324,9 @@ class Searcher:
             problem=problem,
             image=display_image(images.depth, images.colour),
         )
-        self._keep(step, learned)
+        # What the hand holds is to be told first; nothing else of this look counts.
+        if held is None:
+            self._keep(step, learned)
         if self._view is not None:
             self._view.decided(step, decided.tried)
             self._shown = step
@@ -336,6 +358,8 @@ class Searcher:
             acted=False,
             finished=False,
             refusals=self._now.refusals + (not handed),
+            failures=self._now.failures,
+            stopped=self._now.stopped,
             hypothesis_probabilities={} if learned is None else learned.first,
         )
 
@@ -345,10 +369,22 @@ class Searcher:
         Raises:
           InputError: as `next`.
         """
+        if joints is None and self._now.stopped:
+            joints = self._now.stopped
+        return Present(
+            self._checked(joints), None if width is None else checked_width(width, self.problem.gripper.max_opening)
+        )
+
+    def _checked(self, joints: Any) -> Float[np.ndarray, " 7"] | None:
+        """Joint angles [rad] as an array, or None.
+
+        Raises:
+          InputError: they are not seven, or beyond the limits.
+        """
         if joints is not None:
             joints = np.asarray(joints, float)
             check_joints("joints", joints, self.workcell.gripper.arm)
-        return Present(joints, None if width is None else checked_width(width, self.problem.gripper.max_opening))
+        return joints
 
     def _learned(self, before: SearchState, observation: Observation) -> LearnedFriction | None:
         """What trials have learned from all executed actions, with the last images; None if they do not learn.
@@ -360,6 +396,51 @@ class Searcher:
         if learned is not None and now.acted and now.executed:
             learned.learn_first(self.problem, before, observation)
         return learned
+
+    def _without_arm(self, depth: np.ndarray, joints: Float[np.ndarray, " 7"]) -> np.ndarray:
+        """A depth image in which the arm counts as not measured; other arrays, which are refused later, unchanged."""
+        camera = self.workcell.camera
+        if depth.shape != (camera.height, camera.width) or depth.dtype.kind != "f":
+            return depth
+        shown = shows_arm(camera, depth, ArmBody.of(self.problem.gripper.max_opening), joints)
+        return np.where(shown, np.float32(np.nan), depth) if shown.any() else depth
+
+    def _held(self, present: Present) -> Motion | None:
+        """No motion, where the fingers have something between them after a grasp that was reported as failed."""
+        now, kind = self._now, kind_of(int(self._now.action.kind))
+        grasps = now.acted and not now.executed and (kind.takes_target or kind.holds_object)
+        opened, width = float(now.action.opening), present.width
+        if not grasps or width is None or not EMPTY < width < opened - EMPTY:
+            return None
+        what = "the target" if kind.takes_target else f"object {int(now.action.object)}"
+        over = "if it is the target, call acted(ok=True), and the search is over; else " if kind.takes_target else ""
+        why = (
+            f"the hand holds something {1000 * width:.0f} mm wide after a grasp of {what} that was reported as failed; "
+            f"{over}take it out of the hand, or open the hand where it may fall, and give the new width"
+        )
+        return Motion(kind_of(ActionKind.NONE).name, why, None)
+
+    def _way_out(self, observation: Observation, present: Present) -> Motion | None:
+        """The motion out of the shelf, where the hand is inside of it; None where it is not."""
+        if present.joints is None:
+            return None
+        arm = self.workcell.arm
+        try:
+            trajectory = way_out(
+                self.problem,
+                observation,
+                present.joints,
+                home=np.array(arm.home),
+                width=present.width,
+                speed=arm.speed,
+                config=self._motions,
+            )
+        except InputError as error:
+            return Motion(kind_of(ActionKind.NONE).name, f"the hand is inside the shelf; {error}", None)
+        if trajectory is None:
+            return None
+        why = "the hand is inside the shelf: first straight back, out and home, with the fingers as they are"
+        return Motion("withdraw", why, trajectory)
 
     def _decide(
         self,
@@ -375,14 +456,14 @@ class Searcher:
 
         def executable(decision: Decision) -> bool:
             belief, observation = state.belief, state.observation
-            settings = unseen, present, arm, self._motions
+            settings = unseen, present, arm, self._motions, self._now.failures
             motions.append(motion_of(problem, belief, observation, decision, depth, *settings))
             return not motions[-1].blocked
 
         last = self._now.index >= self.config.max_steps
         refused = self._now.refusals
         decided = decide(self._policy, trials, key, problem, state, last=last, refusals=refused, executable=executable)
-        return decided, self._within_limit(motions[-1])
+        return decided, self._within_limit(motions[-1], state)
 
     @property
     def _motions(self) -> TrajectoryConfig:
@@ -390,7 +471,7 @@ class Searcher:
         config, cell = self._trajectories or TrajectoryConfig(), self.workcell
         return dataclasses.replace(config, hand=config.hand or cell.hand, place=config.place or cell.arm.place)
 
-    def _within_limit(self, motion: Motion) -> Motion:
+    def _within_limit(self, motion: Motion, state: SearchState) -> Motion:
         """The motion if the limit of actions allows it; beyond it only the target is taken out, as in an episode."""
         most = self.config.max_steps
         if self._now.index >= most and motion.kind in KEEPS_TARGET:
@@ -398,6 +479,8 @@ class Searcher:
                 f"all {most} actions of max_steps are used up; only a found target is still taken out (raise max_steps "
                 "to go on)"
             )
+            if not state.belief.found:
+                why = f"{why}; {hindrance(self.problem, state.belief, state.observation.objects)}"
             return Motion(kind_of(ActionKind.NONE).name, f"{motion.reason}; not done: {why}", None)
         untried = (
             "; not tried out before"
@@ -407,22 +490,39 @@ class Searcher:
         return motion._replace(reason=motion.reason + untried)
 
     @in_own_settings
-    def acted(self, ok: bool = True) -> None:
+    def acted(self, ok: bool = True, joints: Any = None) -> None:
         """Report that the last step's motion is over, after a failure, too: the hand may have moved something unseen.
 
         Args:
           ok: whether it was executed to its end. A retrieval that was finishes the search; trials that learn do so from
-            other actions that were.
+            other actions that were. A retrieval that was reported as failed, after which the target is in the hand
+            nevertheless, may be reported again.
+          joints: where the arm stopped, seven angles [rad], if that is not where the motion ends: `next` takes it to be
+            there unless it is told otherwise, and takes it out of the shelf first.
 
         Raises:
-          InputError: no motion was returned since the last call.
+          InputError: no motion was returned since the last call, or the joints are impossible.
         """
         now = self._now
-        if not now.handed:
+        kind, stopped = kind_of(int(now.action.kind)), self._checked(joints)
+        if not (now.handed or (ok and now.acted and not now.executed and kind.takes_target)):
             raise InputError("acted: no motion was handed out since the last one; call next first")
-        took = ok and kind_of(int(now.action.kind)).takes_target
-        over = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, executed=ok)
-        self._state = dataclasses.replace(over, finished=took, refusals=0)
+        failures = now.failures
+        if kind.takes_target or kind.holds_object:
+            place = tuple(np.asarray(now.action.T_world_gripper, float)[:3, 3].tolist())
+            failures = () if ok else (*failures, place)
+        self._state = dataclasses.replace(
+            now,
+            # The way out of the shelf is no action.
+            index=now.index + (now.handed and kind.code != ActionKind.NONE),
+            handed=False,
+            acted=True,
+            executed=ok,
+            finished=ok and kind.takes_target,
+            refusals=0,
+            failures=failures,
+            stopped=() if stopped is None else tuple(stopped.tolist()),
+        )
         if self._view is not None and self._shown is not None:
             self._view.acted(self._shown, ok)
 
@@ -439,7 +539,7 @@ class Searcher:
     def load(self, path: PathLike) -> None:
         """Continue a search that was saved by a searcher with the same workcell, configuration and seed.
 
-        The hand and the target's place may have changed.
+        The hand, the camera's pose, the arm's speed and the target's place may have changed.
 
         Raises:
           InputError: the file cannot be read, was not made by `save`, or belongs to another searcher, or to trials that
@@ -458,5 +558,10 @@ class Searcher:
 
     @functools.cached_property
     def _digest(self) -> str:
-        """SHA-256 of everything that a saved state depends on; not of the hand, nor of the target's place."""
-        return hashlib.sha256(repr((self.workcell, self.config, self._seed)).encode()).hexdigest()
+        """SHA-256 of everything that a saved state depends on; not of the hand, the camera's pose, the arm's speed, or
+        the target's place."""
+        cell, camera = self.workcell, Camera()
+        camera = dataclasses.replace(cell.camera, rotation=camera.rotation, position=camera.position)
+        arm = dataclasses.replace(cell.arm, speed=1.0, place=())
+        same = dataclasses.replace(cell, camera=camera, arm=arm)
+        return hashlib.sha256(repr((same, self.config, self._seed)).encode()).hexdigest()

@@ -40,6 +40,8 @@ class State:
       finished: whether the target was taken out.
       refusals: number of steps without a motion since the last action.
       executed: whether that action was executed to its end.
+      failures: places of the gripper in grasps that failed since the last one that did not, [m].
+      stopped: joint angles at which the last motion was broken off [rad]; empty if it was not, or that is not known.
       hypothesis_probabilities: what trials that learn hold of each hypothesis by its name, see
         `planner.learning.LearnsFriction`; empty if they do not learn, or have not yet.
     """
@@ -53,6 +55,8 @@ class State:
     finished: bool
     refusals: int = 0
     executed: bool = True
+    failures: tuple[tuple[float, ...], ...] = ()
+    stopped: tuple[float, ...] = ()
     hypothesis_probabilities: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
@@ -63,10 +67,12 @@ _PLAIN: dict[str, Callable[[Any], Any]] = {
     "finished": bool,
     "refusals": int,
     "executed": bool,
+    "failures": lambda places: tuple(tuple(map(float, place)) for place in places),
+    "stopped": lambda joints: tuple(map(float, joints)),
     "hypothesis_probabilities": lambda values: {str(name): float(value) for name, value in values.items()},
 }
 # What states hold that were saved before these fields existed.
-_ADDED: dict[str, Any] = {"executed": True, "hypothesis_probabilities": {}}
+_ADDED: dict[str, Any] = {"executed": True, "failures": (), "stopped": (), "hypothesis_probabilities": {}}
 _PYTREES = ("belief", "observation", "action")
 
 

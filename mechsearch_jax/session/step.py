@@ -14,7 +14,8 @@ from jaxtyping import Float
 from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief, graspability_map, sweeps_unmeasured
-from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.belief.impasse import hindrance, impasse
+from mechsearch_jax.grasping.retrieval import retrieval_hits
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.planner.state import Decision
@@ -64,6 +65,10 @@ UNMEASURED = (
     "on its way the hand, or what it moves, enters space of which nothing was measured: a thing without depth (black, "
     "shiny, transparent) may stand there; look from elsewhere, or light it otherwise"
 )
+# An action has a gain if the cost is expected to fall by more than this share of it.
+GAIN = 1e-3
+# How often a grasp is tried at a place, and how near another one's place is the same [m].
+TRIES, SAME_PLACE = 2, 0.03
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,13 +144,15 @@ class Motion(NamedTuple):
       kind: name of the kind of action; "none" if it cannot be executed.
       reason: why it is done, or why nothing is.
       trajectory: of the arm; None if nothing is done.
-      blocked: whether the arm cannot execute the action; another one may be possible.
+      blocked: whether the action is not to be made; another one may be possible.
+      warnings: what it is known to do beside what it is for, a line each.
     """
 
     kind: str
     reason: str
     trajectory: RobotTrajectory | None
     blocked: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 class Present(NamedTuple):
@@ -170,6 +177,7 @@ def motion_of(
     present: Present,
     arm: ArmConfig,
     config: TrajectoryConfig,
+    failures: tuple[tuple[float, ...], ...] = (),
 ) -> Motion:
     """The motion of a decision, or why there is none.
 
@@ -180,6 +188,7 @@ def motion_of(
       present: arm and hand.
       arm: home and speed.
       config: how trajectories are made.
+      failures: places of the gripper in grasps that failed [m].
     """
     kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
     target = "the target is found" if belief.found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
@@ -190,8 +199,18 @@ def motion_of(
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
     verb = kind.describe(decision.action, observation.objects.capacity)
+
+    def refused(why: str) -> Motion:
+        return Motion(nothing, f"{target}; to {verb} is not possible: {why}", None, blocked=True)
+
+    if not kind.takes_target and not config.without_gain and not gains(decision):
+        why = f"no gain is expected of what could be done; {hindrance(problem, belief, observation.objects)}"
+        return Motion(nothing, f"{target}; {why}", None, blocked=True)
+    place = np.asarray(decision.action.T_world_gripper)[:3, 3]
+    if (kind.takes_target or kind.holds_object) and _times(failures, place) >= TRIES:
+        return refused(f"{TRIES} grasps failed at this place; see why, and mend that or move it by hand")
     if sweeps_unmeasured(problem, belief, observation.objects, decision.action):
-        return Motion(nothing, f"{target}; to {verb} is not possible: {UNMEASURED}", None, blocked=True)
+        return refused(UNMEASURED)
     try:
         check_recognition(problem, observation, depth, config.doubt)
     except InputError as error:
@@ -208,11 +227,26 @@ def motion_of(
             config=config,
         )
     except InputError as error:
-        return Motion(nothing, f"{target}; to {verb} is not possible: {error}", None, blocked=True)
+        return refused(str(error))
     if kind.takes_target:
-        return Motion(kind.name, f"{target}; {verb}: a grasp that takes it out is known", trajectory)
+        hit = retrieval_hits(problem.target_grasps, belief.grasps, observation.objects, decision.action)
+        brushed = " and ".join(f"object {i}" for i in np.flatnonzero(np.asarray(hit)))
+        known = f"a grasp that takes it out is known{brushed and '; it will brush '}{brushed}"
+        warnings = (f"the hand, or the target in it, will brush {brushed} on its way",) if brushed else ()
+        return Motion(kind.name, f"{target}; {verb}: {known}", trajectory, warnings=warnings)
     cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
     return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory)
+
+
+def gains(decision: Decision) -> bool:
+    """Whether a lower cost is expected after a decision's action, or after actions that it begins."""
+    cost, best = float(decision.cost), float(jnp.min(decision.sequences.cost[0]))
+    return not min(best, float(decision.predicted_cost)) >= cost - GAIN * abs(cost) or cost == 0.0
+
+
+def _times(failures: tuple[tuple[float, ...], ...], place: np.ndarray) -> int:
+    """How many failures were at a place."""
+    return sum(float(np.linalg.norm(np.subtract(failure, place))) < SAME_PLACE for failure in failures)
 
 
 def display_image(depth: np.ndarray, colour: Any) -> np.ndarray:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.kind import Kind
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.trajectory import grasped, grip_for, reference_motion, target_pose
 from mechsearch_jax.actions.types import Action
@@ -19,9 +20,18 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
-from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearance, tip_positions
+from mechsearch_jax.robot.arm_clearance import (
+    HAND_FRAME,
+    ArmBody,
+    Held,
+    Obstacles,
+    clearance,
+    link_poses,
+    tip_positions,
+)
 from mechsearch_jax.robot.arm_config import check_joints, check_place
-from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, free_motion, timed_rows
+from mechsearch_jax.robot.entry import ways_in
+from mechsearch_jax.robot.free_motion import WAYPOINTS, FreeMotion, FreeMotionConfig, free_motion, respaced, timed_rows
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig, HandMove, checked_width, longest_way, stroke
 from mechsearch_jax.robot.kinematics import HOME
@@ -34,6 +44,9 @@ from mechsearch_jax.workspace.target_view import body_at
 
 # Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
 OUTSIDE = 2e-3
+# How far a joint may be from where inverse kinematics has it [rad], and how much nearer to the shelf than where it is
+# the arm may come on its way out [m].
+AT_REST, NEARER = 0.02, 0.005
 
 
 class Setting(recogniser.Setting, Protocol):
@@ -54,6 +67,7 @@ class TrajectoryConfig:
       doubt: when recognition is too doubtful to move.
       hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
       place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
+      without_gain: whether a `Searcher` also hands out motions of which no lower cost is expected.
     """
 
     motion: MotionConfig | None = None
@@ -62,6 +76,7 @@ class TrajectoryConfig:
     doubt: DoubtConfig = dataclasses.field(default_factory=DoubtConfig)
     hand: HandConfig | None = None
     place: tuple[float, ...] = ()
+    without_gain: bool = False
 
     def __post_init__(self):
         check_place("TrajectoryConfig: place", self.place)
@@ -135,6 +150,36 @@ def whole_trajectory(
     return _Assembly(problem, observation, action, after, config, speed).run(joints, home, width)
 
 
+@in_own_settings
+def way_out(
+    problem: Setting,
+    observation: Observation,
+    joints: Float[np.ndarray, " 7"],
+    *,
+    home: Any = None,
+    width: float | None = None,
+    speed: float = 1.0,
+    config: TrajectoryConfig | None = None,
+) -> RobotTrajectory | None:
+    """The trajectory of a hand inside the shelf straight back, out and home, with its fingers as they are; None for a
+    hand outside. Not to be called inside `jit`.
+
+    Args:
+      problem, observation, home, width, speed, config: as of `whole_trajectory`.
+      joints: present joint angles [rad].
+
+    Raises:
+      InputError: the arm does not follow that way in its present configuration, or comes nearer to the shelf on it; or
+        the way home is blocked.
+    """
+    config = config or TrajectoryConfig()
+    home = np.array(HOME if home is None else home, float)
+    if tip_positions(joints[None])[0, 0] <= problem.gripper.nearest_outside + OUTSIDE:
+        return None
+    making = _Assembly(problem, observation.with_boxes(), no_action(), None, config, speed)
+    return making.out(joints, home, problem.gripper.max_opening if width is None else width)
+
+
 class _Assembly:
     """The making of one trajectory."""
 
@@ -179,6 +224,33 @@ class _Assembly:
         at_home = way_home is not None
         stages += [way_home] if way_home is not None else []
         return self._joined(joints, present, stages, at_home, between, fault)
+
+    def out(self, joints: np.ndarray, home: np.ndarray, width: float) -> RobotTrajectory:
+        """`way_out`."""
+        gripper, arm = self.problem.gripper, self.motion.gripper.arm
+        T = np.array(link_poses(joints[None])[0, HAND_FRAME], float)
+        T[:3, 3] = tip_positions(joints[None])[0]
+        waypoints = self.motion.waypoints
+        way, follows, _ = ways_in(jnp.asarray(T), jnp.float32(joints[6]), gripper, waypoints, waypoints)
+        q = np.array(way, float)[::-1]
+        if not follows or np.abs(q[0] - joints).max() > AT_REST:
+            raise InputError("withdraw: the arm cannot follow a straight way out of the shelf; take it out by hand")
+        q[0] = joints
+        body, shelf = ArmBody.of(width), Obstacles.of(self.problem.shelf, (), self.config.free.floor)
+        free = clearance(body, shelf, q).free
+        if free.min() < min(float(free[0]), 0.0) - NEARER:
+            raise InputError("withdraw: on a straight way out the arm would touch the shelf; take it out by hand")
+        # What is the same pose twice would have no direction.
+        apart = np.concatenate([[True], np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-6])
+        pace = self.speed * self.motion.carry_pace
+        rows = timed_rows(respaced(q[apart], WAYPOINTS), self.motion.timestep, pace, arm=arm)
+        still = np.full(len(rows), width)
+        back = self._free("the way home", rows[-1], home, body, self._obstacles())
+        stages = [
+            _Stage(Part.WAY_HOME, Rows(rows, still, np.zeros(len(rows)))),
+            self._travel(Part.WAY_HOME, back, width),
+        ]
+        return dataclasses.replace(self._joined(joints, width, stages, True), action="withdraw")
 
     def _way_there(self, joints: np.ndarray, end: np.ndarray, before: float, after: float, least: float) -> _Stage:
         """The way to where the action begins, while the fingers move from one distance to another."""
