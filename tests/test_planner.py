@@ -503,7 +503,7 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
     probability = jax.jit(jax.vmap(lambda s: contact_probability(problem.space, root.scene, possible, s)))
     drawn = jax.vmap(lambda key: somewhere(jax.random.fold_in(key, 0)))(keys)
     share = np.asarray(probability(drawn))
-    assert len(np.unique(share)) > 2
+    assert len(np.unique(share[:, 0])) > 2
     penalties = penalties_of(rollout_of(problem, belief, policy), root, keys)
     np.testing.assert_allclose(penalties, 0.5 * share, rtol=1e-6)
     policy = dataclasses.replace(policy, propose=lambda *_: Sample(action, jnp.int32(0)))
@@ -521,13 +521,21 @@ def test_what_is_dear_is_not_chosen():
 
 def test_a_risk_is_taken_only_where_nothing_else_gains():
     acted = jnp.ones((2, 1), bool)
-    risky = jnp.float32([[19.0], [0.0]])
-    # The first sequence gains 10 at a penalty of 19; the second 0.1 or 4 at none.
-    for safe, best, value in ((19.9, 0, -10.0), (16.0, 1, -4.0)):
+    # The first sequence gains 10 at a penalty of 19 of one kind or the other; the second 0.1 or 4 at none.
+    for kind, (safe, best, value) in itertools.product((0, 1), ((19.9, 0, -10.0), (16.0, 1, -4.0))):
+        risky = jnp.zeros((2, 1, 2)).at[0, 0, kind].set(19.0)
         values, length = sequence_values(jnp.float32([[20.0, 10.0], [20.0, safe]]), risky, acted, 0.9)
         assert int(jnp.argmin(values)) == best
         assert float(values[best]) == pytest.approx(value)
         assert length.tolist() == [1, 1]
+
+
+def test_where_every_action_sweeps_what_was_not_measured_the_target_is_still_not_touched():
+    # Both sweep it; the first gains 10 and would surely touch the target, the second gains 4 and would not.
+    penalty = jnp.float32([[[20.0, 20.0]], [[0.0, 20.0]]])
+    values, _ = sequence_values(jnp.float32([[20.0, 10.0], [20.0, 16.0]]), penalty, jnp.ones((2, 1), bool), 0.9)
+    assert int(jnp.argmin(values)) == 1
+    assert float(values[1]) == pytest.approx(-4.0)
 
 
 @pytest.mark.slow

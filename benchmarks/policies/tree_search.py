@@ -74,7 +74,7 @@ def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
         depth=node.depth + 1,
         cost=rollout.cost(state),
         action=action,
-        penalty=penalty * node.cost,
+        penalty=jnp.sum(penalty) * node.cost,
     )
 
 

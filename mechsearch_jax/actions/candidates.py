@@ -274,8 +274,9 @@ def sample_action(
 
 def contact_probability(
     space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, sample: Sample
-) -> Float[Array, ""]:
-    """Share of the possible poses at which a sampled action would touch the target; 0 if no pose is possible.
+) -> Float[Array, "2"]:
+    """Share of the possible poses at which a sampled action would touch the target, 0 if no pose is possible; and 1 if
+    it enters space that was not measured, else 0.
 
     Args:
       space: what all actions share.
@@ -284,7 +285,7 @@ def contact_probability(
       sample: the action.
     """
     if sample.grippers is None or sample.bodies is None:
-        return jnp.float32(0.0)
+        return jnp.zeros(2)
     action = sample.action
     opening = jnp.select([action.kind == kind.code for kind in SAMPLED_KINDS], [k.opening for k in SAMPLED_KINDS])
     body = surface_of(scene, action.object, space.config.object_points)

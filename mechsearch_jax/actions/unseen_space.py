@@ -78,12 +78,13 @@ def cloud_enters(
     return jnp.any(_enters(space, *transform_rows(T_world_cloud, cloud)), axis=-1)
 
 
-def touch_probability(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, ""]:
-    """Share of the possible poses at which points would touch the target; 1 if they enter what was not measured."""
+def touch_probability(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, "2"]:
+    """Share of the possible poses at which points would touch the target; and 1 if they enter what was not measured,
+    else 0."""
     points = points.reshape(-1, 3)
     row, column, inside = _cells(space, points[:, 0], points[:, 1])
     low = points[:, 2] < jnp.max(space.target)
     touched = jnp.zeros(space.target.shape, bool).at[row, column].max(inside & low)
     touched = touched[BORDER:-BORDER, BORDER:-BORDER]
     probability = jnp.sum(jnp.where(widen(touched), space.chance, 0.0))
-    return jnp.where(jnp.any(enters_unmeasured(space, points)), 1.0, probability)
+    return jnp.stack([probability, jnp.any(enters_unmeasured(space, points)).astype(probability.dtype)])

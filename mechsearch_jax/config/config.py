@@ -60,8 +60,9 @@ class PlannerConfig:
       horizon: M, actions in a sequence; static.
       sequences: number of sequences sampled for a decision; static.
       unseen_contact_penalty: cost of touching the hidden target, in units of J: the penalty of a sampled action is J
-        times the share of the possible poses at which it would touch the target, unless no sequence gains anything
-        then. The paper has none.
+        times the share of the possible poses at which it would touch the target, and J more if it enters space that
+        was not measured. If no sequence gains anything then, the latter is dropped, and if none does still, the former.
+        The paper has none.
       guided_fraction: share of the draws that prefer objects that hide much or are in the way, from 0 to below 1; the
         other draws are uniform, as all are in the paper.
       crowding_weight: weight in J of objects that only some of a pose's grasps hit; the paper's J counts the best grasp

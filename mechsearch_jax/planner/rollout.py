@@ -54,16 +54,24 @@ def prefix_values(
 
 
 def sequence_values(
-    cost: Float[Array, "s n"], penalty: Float[Array, "s m"], acted: Bool[Array, "s m"], gamma: Array | float
+    cost: Float[Array, "s n"], penalty: Float[Array, "s m 2"], acted: Bool[Array, "s m"], gamma: Array | float
 ) -> tuple[Float[Array, " s"], Int[Array, " s"]]:
     """`prefix_values` of all sequences, which begin in the same state.
 
-    If no sequence gains, penalties are dropped: a risky action is better than none.
+    If no sequence gains, penalties are dropped: first those of space that was not measured, the last ones, then those
+    of touching the target, too. A risky action is better than none.
     """
     values = jax.vmap(functools.partial(prefix_values, gamma=gamma))
-    penalised, free = values(cost, penalty, acted), values(cost, jnp.zeros_like(penalty), acted)
-    stuck = jnp.min(penalised[0]) > -GAIN * cost[0, 0]
-    return jax.tree.map(functools.partial(jnp.where, stuck), free, penalised)
+    wary, measured, free = (
+        values(cost, risk, acted)
+        for risk in (jnp.sum(penalty, axis=-1), penalty[..., 0], jnp.zeros_like(penalty[..., 0]))
+    )
+
+    def unless_stuck(chosen, bolder):
+        stuck = jnp.min(chosen[0]) > -GAIN * cost[0, 0]
+        return jax.tree.map(functools.partial(jnp.where, stuck), bolder, chosen)
+
+    return unless_stuck(wary, unless_stuck(measured, free))
 
 
 def present_state(problem: Problem, belief: Belief, objects: Superquadrics, config: PlannerConfig) -> State:
@@ -170,7 +178,7 @@ class Rollout:
         return _draw_one_by_one(attempt, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), state, draws)
 
     def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
-        """Sample an action in a state: the predicted changes, the action, and its penalty as a share of J."""
+        """Sample an action in a state: the predicted changes, the action, and its penalties as shares of J, (2,)."""
         sample, prediction = self._draw(first, state, key)
         acted = prediction.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
@@ -189,9 +197,9 @@ class Rollout:
         }
         return changes, action, self.config.unseen_contact_penalty * self.contact_probability(state, sample)
 
-    def contact_probability(self, state: State, sample: Sample) -> Float[Array, ""]:
-        """Share of the possible poses at which an action would touch the target, where it was drawn; 1 if it enters
-        space that was not measured.
+    def contact_probability(self, state: State, sample: Sample) -> Float[Array, "2"]:
+        """Share of the possible poses at which an action would touch the target, where it was drawn; and whether it
+        enters space that was not measured.
         """
         possible = possible_space(self.problem, self.belief, state.exists)
         return contact_probability(self.problem.space, state.scene, possible, sample)
@@ -214,7 +222,7 @@ class Rollout:
 
         def stay():
             changes = {name: getattr(states, name) for name in CHANGING}
-            return changes, repeated(no_action(), count), jnp.zeros(count)
+            return changes, repeated(no_action(), count), jnp.zeros((count, 2))
 
         # After the last action only the cost counts. Fields that actions do not change stay out of the branches.
         changes, actions, penalty = jax.lax.cond(time < self.config.horizon, act_all, stay)
@@ -284,7 +292,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     )
     actions, penalty = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, penalty))
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
-    value, length = sequence_values(cost, penalty * cost[:, :-1], actions.kind != ActionKind.NONE, config.gamma)
+    value, length = sequence_values(cost, penalty * cost[:, :-1, None], actions.kind != ActionKind.NONE, config.gamma)
     # Without the target's slot, the last.
     after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)
