@@ -1,0 +1,250 @@
+"""A trajectory executed by servos in physics: what was touched and how hard, what the hand holds, and what moved."""
+
+import collections
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+
+from .limits import PERIOD, each_millisecond
+from .world import BOARD, DAMPING, FRONT, GAINS, STAND
+
+FINGERS = ("left finger", "right finger")
+# Forces are means over so many milliseconds: an impact's single peak depends on the contact's stiffness.
+WINDOW = 10
+# How often it is noted what the hand holds [ms], and how long the arm waits for a hand that still moves [s].
+EVERY, PATIENCE = 20, 3.0
+# A finger: stiffness [N/m], damping [N s/m]; force of a move without a grip [N]; rest [m/s]; a move's tolerance [m].
+STIFF, DAMP, MOVING_FORCE, REST, REACHED = 4000.0, 80.0, 30.0, 2e-3, 2.5e-3
+SETTLE = 0.6
+# A thing that is let go so far above what is below it is dropped [m].
+DROP = 0.02
+
+
+@dataclasses.dataclass
+class Hand:
+    """What the hand is about: fingers move to `width` at `speed` with at most `force`; a grip's width is below 0."""
+
+    width: float = 0.08
+    speed: float = 0.1
+    force: float = MOVING_FORCE
+    wanted: float = 0.08
+
+    def begin(self, event, width):
+        """Begin an event with the fingers `width` apart."""
+        grasp = event.kind == "grasp"
+        self.wanted, self.speed = width, event.speed
+        self.width, self.force = (-0.06, event.force) if grasp else (event.width, MOVING_FORCE)
+
+    def forces(self, data):
+        """Of both fingers' motors [N]; to be called each millisecond."""
+        step = self.speed * PERIOD
+        self.wanted += float(np.clip(self.width - self.wanted, -step, step))
+        return np.clip(STIFF * (self.wanted / 2 - data.qpos[7:9]) - DAMP * data.qvel[7:9], -self.force, self.force)
+
+
+@dataclasses.dataclass
+class Executed:
+    """What came of a motion.
+
+    Attributes:
+      ok: whether arm and hand did all that they were to do.
+      notes: what went wrong, a line each.
+      forces: the largest force between two bodies [N], of the robot or what it holds.
+      gaps: largest deviation of a joint from its path [rad].
+      grasps: of each grasp what width was expected, what was measured [m], and what was between the fingers.
+      held: what is between the fingers at the end.
+      lifted: what was lifted; dropped: what fell out of the hand, and whether the hand opened or it slipped.
+      moved: how far [m] and by how much [degrees] things turned that were moved.
+    """
+
+    ok: bool = True
+    notes: list = dataclasses.field(default_factory=list)
+    forces: dict = dataclasses.field(default_factory=dict)
+    gap: float = 0.0
+    grasps: list = dataclasses.field(default_factory=list)
+    held: list = dataclasses.field(default_factory=list)
+    lifted: list = dataclasses.field(default_factory=list)
+    dropped: dict = dataclasses.field(default_factory=dict)
+    moved: dict = dataclasses.field(default_factory=dict)
+
+
+class _Watch:
+    """Contacts and held things while physics goes on."""
+
+    def __init__(self, world, hand, result):
+        self.world, self.hand, self.result = world, hand, result
+        self.recent = collections.defaultdict(lambda: np.zeros((WINDOW, 3)))
+        self.pull = np.zeros((WINDOW, 3))
+        self.foot = {name: pose[0][2] for name, pose in world.poses().items()}
+        self.held, self.count = held_things(world), 0
+
+    def step(self):
+        """Advance physics by a millisecond, and note what touches what."""
+        world, data, row = self.world, self.world.data, self.count % WINDOW
+        data.ctrl[7:9] = self.hand.forces(data)
+        mujoco.mj_step(world.model, data)
+        for values in (*self.recent.values(), self.pull):
+            values[row] = 0.0
+        for i in range(data.ncon):
+            one, two = data.contact.geom[i]
+            a, b = str(world.geom_owner[one]), str(world.geom_owner[two])
+            robot = world.robot_geom[one], world.robot_geom[two]
+            if not any(robot) and a not in self.held and b not in self.held:
+                continue
+            local = np.zeros(6)
+            mujoco.mj_contactForce(world.model, data, i, local)
+            force = data.contact.frame[i].reshape(3, 3).T @ local[:3]
+            if not any(robot) and ({a, b} & {"shelf", "stand"}) and abs(force[2]) > 0.7 * np.linalg.norm(force):
+                continue  # what is held stands on something, too
+            # MuJoCo's force is the second geom's.
+            if robot[0] or (not any(robot) and a in self.held):
+                a, b, force = b, a, -force
+            self.recent[b if any(robot) else f"{b} (held)", a][row] += force
+            if any(robot) and b != "arm":
+                self.pull[row] += force
+        for pair, values in self.recent.items():
+            size = float(np.linalg.norm(values.mean(axis=0)))
+            self.result.forces[pair] = max(self.result.forces.get(pair, 0.0), size)
+        self.count += 1
+        if self.count % EVERY == 0:
+            self._note_held()
+
+    def _note_held(self):
+        now, poses = held_things(self.world), self.world.poses()
+        for name in now:
+            if poses[name][0][2] > self.foot[name] + 0.01 and name not in self.result.lifted:
+                self.result.lifted.append(name)
+        for name in self.held - now:
+            drop = height_above(self.world, name)
+            if drop > DROP and name not in self.result.dropped:
+                why = "the hand opened" if self.hand.width > 0 else "it slipped"
+                self.result.dropped[name] = f"{why}, {100 * drop:.0f} cm above what is below"
+        for name in now:
+            if self.result.dropped.get(name, "").startswith("it slipped"):
+                del self.result.dropped[name]  # it only shifted between the fingers
+        self.held = now
+
+
+def held_things(world):
+    """Names of things that touch both fingers."""
+    touching = {finger: set() for finger in FINGERS}
+    for one, two in world.data.contact.geom:
+        for a, b in ((one, two), (two, one)):
+            if world.geom_owner[a] in touching:
+                touching[str(world.geom_owner[a])].add(str(world.geom_owner[b]))
+    return set.intersection(*touching.values()) & set(world.things)
+
+
+def height_above(world, name):
+    """How far the lowest point of a thing is above board, stand or floor [m], whichever is below its middle."""
+    body = world.model.body(name).id
+    low = math.inf
+    for i in np.flatnonzero(world.model.geom_bodyid == body):
+        up, size = world.data.geom_xmat[i].reshape(3, 3)[2], world.model.geom_size[i]
+        if world.model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX:
+            extent = np.abs(up) @ size
+        else:
+            extent = abs(up[2]) * size[1] + math.hypot(*up[:2]) * size[0]
+        low = min(low, world.data.geom_xpos[i][2] - extent)
+    x, y, _ = world.data.xpos[body]
+    on_stand = max(abs(x - STAND[0]), abs(y - STAND[1])) < 0.09
+    return low - (STAND[2] if on_stand else BOARD if x > FRONT else 0.0)
+
+
+def rest(world, hand, seconds):
+    """Let physics go on with the arm held where it is."""
+    watch, q = _Watch(world, hand, Executed()), world.joints
+    for _ in range(int(seconds / PERIOD)):
+        world.data.ctrl[:7] = q
+        watch.step()
+
+
+def follow(world, hand, rows, events, tracking, force):
+    """Execute a trajectory as a controller and a Franka Hand would.
+
+    Where a waiting event is not over in time, the arm waits on. If a move of the hand on the way to the shelf fails,
+    the arm goes the same way back; after a failed grasp it goes on, for that is its way out.
+
+    Args:
+      world, hand: the cell.
+      rows: time (T,), joint positions and velocities (T, 7).
+      events: of the hand, with kind, start, duration, waits, width, speed and of grasps force, inner and outer.
+      tracking, force: deviation of a joint [rad] and force on the hand [N] at which the controller stops.
+    """
+    result = Executed()
+    watch, before = _Watch(world, hand, result), world.poses()
+    _, q, v = each_millisecond(*rows)
+    lead = np.array(DAMPING) / np.array(GAINS)
+    begun, ended = set(), set()
+    at, direction, waited = 0, 1, 0
+    while 0 <= at < len(q):
+        seconds = at * PERIOD
+        for i, event in enumerate(events):
+            if direction == 1 and i not in begun and seconds >= event.start:
+                begun.add(i)
+                hand.begin(event, world.width)
+            if direction == 1 and i in begun - ended and seconds >= event.start + event.duration:
+                still = np.abs(world.data.qvel[7:9]).max() < REST
+                if not still and waited < PATIENCE / PERIOD:
+                    waited += 1
+                    break
+                ended.add(i)
+                waited = 0
+                done = _event_done(world, event, result)
+                result.ok &= done
+                if not done and event.kind == "move" and not event.waits:
+                    direction = -1
+        else:
+            waited = 0
+        paused = waited > 0
+        world.data.ctrl[:7] = q[at] + (0.0 if paused else direction * lead * v[at])
+        watch.step()
+        gap = float(np.abs(world.data.qpos[:7] - q[at]).max())
+        result.gap = max(result.gap, gap)
+        pull = float(np.linalg.norm(watch.pull.mean(axis=0)))
+        if gap > tracking or pull > force:
+            what = f"a joint is {gap:.3f} rad off its path" if gap > tracking else f"{pull:.0f} N on the hand"
+            result.notes.append(f"the controller stopped the arm at {seconds:.2f} s: {what}")
+            result.ok = False
+            break
+        at += 0 if paused else direction
+    hold = world.joints if not result.ok and 0 <= at < len(q) else q[min(max(at, 0), len(q) - 1)]
+    for _ in range(int(SETTLE / PERIOD)):
+        world.data.ctrl[:7] = hold
+        watch.step()
+    after = world.poses()
+    for name, (place, turned) in after.items():
+        shift = float(np.linalg.norm(place - before[name][0]))
+        tilt = math.degrees(math.acos(np.clip(before[name][1][:, 2] @ turned[:, 2], -1, 1)))
+        if shift > 0.003 or tilt > 3.0:
+            result.moved[name] = [round(shift, 4), round(tilt, 1)]
+    result.held = sorted(held_things(world))
+    return result
+
+
+def _event_done(world, event, result):
+    width = world.width
+    if event.kind == "move":
+        done = abs(width - event.width) < REACHED
+        if not done:
+            result.notes.append(f"the hand did not move to {1000 * event.width:.0f} mm, but {1000 * width:.0f}")
+        return done
+    between = sorted(held_things(world))
+    done = event.width - event.inner <= width <= event.width + event.outer
+    result.grasps.append(
+        {
+            "expected": round(event.width, 4),
+            "inner": round(event.inner, 4),
+            "outer": round(event.outer, 4),
+            "measured": round(width, 4),
+            "between": between,
+        }
+    )
+    if not done:
+        result.notes.append(
+            f"the grasp failed by its width: {1000 * width:.0f} mm where {1000 * event.width:.0f} were expected, with "
+            f"{' and '.join(between) or 'nothing'} between the fingers"
+        )
+    return done
