@@ -8,7 +8,6 @@ import concurrent.futures
 import json
 import multiprocessing
 import os
-import traceback
 from pathlib import Path
 
 from . import search, summary
@@ -25,54 +24,25 @@ def main():
     parser.add_argument("--film", action="store_true", help="draw the images of lost searches")
     parser.add_argument("--report", action="store_true", help="only print what there is")
     given = parser.parse_args()
-    rows = given.out / "rows"
+    rows, what = given.out / "rows", (given.target, given.arm)
     rows.mkdir(parents=True, exist_ok=True)
     jobs = [(layout, seed) for seed in range(given.seeds) for layout in range(given.layouts)]
-    jobs = [job for job in jobs if not _path(rows, given, *job).exists() and not given.report]
+    jobs = [job for job in jobs if not search.row_file(given.out, *job, *what).exists() and not given.report]
     # What workers read as they import NumPy and JAX.
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
     context = multiprocessing.get_context("spawn")
-    settings = {"mp_context": context, "initializer": _on_one_core, "initargs": (context.Value("i", 0), given.workers)}
+    settings = {
+        "mp_context": context,
+        "initializer": search.on_one_core,
+        "initargs": (context.Value("i", 0), given.workers),
+    }
     with concurrent.futures.ProcessPoolExecutor(given.workers, **settings) as pool:
-        running = {pool.submit(_search, given, layout, seed): (layout, seed) for layout, seed in jobs}
+        running = {pool.submit(search.kept, *job, *what, given.out, given.film): job for job in jobs}
         for done in concurrent.futures.as_completed(running):
             print(*running[done], done.result(), flush=True)
     kept = [json.loads(path.read_text()) for path in sorted(rows.glob(f"{given.target}-{given.arm}-*.json"))]
     print(summary.table(kept))
     (given.out / f"summary-{given.target}-{given.arm}.md").write_text(summary.table(kept) + "\n")
-
-
-def _on_one_core(count, workers):
-    """Keep this process, and so all its threads, to a core of its own; one alone takes what there is."""
-    if workers == 1:
-        return
-    with count.get_lock():
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[count.value % len(cores)]})
-        count.value += 1
-
-
-def _path(rows, given, layout, seed):
-    return rows / f"{given.target}-{given.arm}-{layout}-{seed}.json"
-
-
-def _search(given, layout, seed):
-    try:
-        row = search.run(layout, seed, given.target, given.arm, given.out, given.film)
-    except Exception as error:
-        # An error is a lost search with its reason, and does not end the others.
-        row = {
-            "layout": layout,
-            "seed": seed,
-            "target": given.target,
-            "arm": given.arm,
-            "retrieved": False,
-            "why": f"error: {type(error).__name__}: {error}",
-            "trace": traceback.format_exc(),
-            "steps": [],
-        }
-    search.save(row, _path(given.out / "rows", given, layout, seed))
-    return f"{'retrieved' if row['retrieved'] else 'lost'}: {row['why']}"
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from .limits import PERIOD, each_millisecond
 from .world import BOARD, DAMPING, FRONT, GAINS, STAND
 
 FINGERS = ("left finger", "right finger")
+PULL = ("all", "hand")
 # Forces are means over so many milliseconds: an impact's single peak depends on the contact's stiffness.
 WINDOW = 10
 # How often it is noted what the hand holds [ms], and how long the arm waits for a hand that still moves [s].
@@ -75,41 +76,60 @@ class _Watch:
 
     def __init__(self, world, hand, result):
         self.world, self.hand, self.result = world, hand, result
-        self.recent = collections.defaultdict(lambda: np.zeros((WINDOW, 3)))
-        self.pull = np.zeros((WINDOW, 3))
+        # Of each pair of bodies, and of the hand with its fingers, the forces of the last milliseconds and their sum.
+        self.recent = collections.defaultdict(lambda: (collections.deque([np.zeros(3)] * WINDOW), np.zeros(3)))
         self.foot = {name: pose[0][2] for name, pose in world.poses().items()}
-        self.held, self.count = held_things(world), 0
+        self.count, self.pull = 0, 0.0
+        self._hold(held_things(world))
+
+    def _hold(self, held):
+        self.held = held
+        self.watched = self.world.robot_geom | np.isin(self.world.geom_owner, sorted(held))
 
     def step(self):
         """Advance physics by a millisecond, and note what touches what."""
-        world, data, row = self.world, self.world.data, self.count % WINDOW
+        world, data = self.world, self.world.data
         data.ctrl[7:9] = self.hand.forces(data)
         mujoco.mj_step(world.model, data)
-        for values in (*self.recent.values(), self.pull):
-            values[row] = 0.0
-        for i in range(data.ncon):
-            one, two = data.contact.geom[i]
-            a, b = str(world.geom_owner[one]), str(world.geom_owner[two])
-            robot = world.robot_geom[one], world.robot_geom[two]
-            if not any(robot) and a not in self.held and b not in self.held:
-                continue
-            local = np.zeros(6)
-            mujoco.mj_contactForce(world.model, data, i, local)
-            force = data.contact.frame[i].reshape(3, 3).T @ local[:3]
-            if not any(robot) and ({a, b} & {"shelf", "stand"}) and abs(force[2]) > 0.7 * np.linalg.norm(force):
-                continue  # what is held stands on something, too
-            # MuJoCo's force is the second geom's.
-            if robot[0] or (not any(robot) and a in self.held):
-                a, b, force = b, a, -force
-            self.recent[b if any(robot) else f"{b} (held)", a][row] += force
-            if any(robot) and b != "arm":
-                self.pull[row] += force
-        for pair, values in self.recent.items():
-            size = float(np.linalg.norm(values.mean(axis=0)))
-            self.result.forces[pair] = max(self.result.forces.get(pair, 0.0), size)
+        now = self._forces()
+        for pair in self.recent.keys() | now.keys():
+            kept, total = self.recent[pair]
+            force = now.get(pair, np.zeros(3))
+            total += force - kept.popleft()
+            kept.append(force)
+            size = float(np.linalg.norm(total)) / WINDOW
+            if pair == PULL:
+                self.pull = size
+            else:
+                self.result.forces[pair] = max(self.result.forces.get(pair, 0.0), size)
+        for pair in [pair for pair, (kept, _) in self.recent.items() if not any(force.any() for force in kept)]:
+            del self.recent[pair]
+            self.pull = 0.0 if pair == PULL else self.pull
         self.count += 1
         if self.count % EVERY == 0:
             self._note_held()
+
+    def _forces(self):
+        """Force on the robot, or on what it holds, of each pair of bodies at present, and on the hand [N]."""
+        world, data, found = self.world, self.world.data, {}
+        geoms = data.contact.geom
+        for i in np.flatnonzero(self.watched[geoms].any(axis=1)) if len(geoms) else ():
+            a, b = (str(owner) for owner in world.geom_owner[geoms[i]])
+            robot = world.robot_geom[geoms[i]]
+            local = np.zeros(6)
+            mujoco.mj_contactForce(world.model, data, i, local)
+            force = data.contact.frame[i].reshape(3, 3).T @ local[:3]
+            if not robot.any() and {a, b} & {"shelf", "stand"} and abs(force[2]) > 0.7 * np.linalg.norm(force):
+                continue  # what is held stands on something, too
+            # MuJoCo's force is the second geom's.
+            if robot[0] or (not robot.any() and a in self.held):
+                a, b, force = b, a, -force
+            pairs = [(b if robot.any() else f"{b} (held)", a)]
+            if robot.any() and b != "arm":
+                pairs.append(PULL)
+            for pair in pairs:
+                found[pair] = found.get(pair, 0.0) + force
+        return found
 
     def _note_held(self):
         now, poses = held_things(self.world), self.world.poses()
@@ -124,7 +144,7 @@ class _Watch:
         for name in now:
             if self.result.dropped.get(name, "").startswith("it slipped"):
                 del self.result.dropped[name]  # it only shifted between the fingers
-        self.held = now
+        self._hold(now)
 
 
 def held_things(world):
@@ -193,7 +213,7 @@ def follow(world, hand, rows, events, tracking, force):
                 ended.add(i)
                 waited = 0
                 done = _event_done(world, event, result)
-                result.ok &= done
+                result.ok = result.ok and bool(done)
                 if not done and event.kind == "move" and not event.waits:
                     direction = -1
         else:
@@ -203,9 +223,8 @@ def follow(world, hand, rows, events, tracking, force):
         watch.step()
         gap = float(np.abs(world.data.qpos[:7] - q[at]).max())
         result.gap = max(result.gap, gap)
-        pull = float(np.linalg.norm(watch.pull.mean(axis=0)))
-        if gap > tracking or pull > force:
-            what = f"a joint is {gap:.3f} rad off its path" if gap > tracking else f"{pull:.0f} N on the hand"
+        if gap > tracking or watch.pull > force:
+            what = f"a joint is {gap:.3f} rad off its path" if gap > tracking else f"{watch.pull:.0f} N on the hand"
             result.notes.append(f"the controller stopped the arm at {seconds:.2f} s: {what}")
             result.ok = False
             break

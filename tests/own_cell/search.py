@@ -3,8 +3,10 @@
 import inspect
 import json
 import math
+import os
 import re
 import time
+import traceback
 
 import numpy as np
 
@@ -194,8 +196,31 @@ def draw(frames, path, title):
     plt.close(figure)
 
 
-def save(row, path):
-    """Write a row at once or not at all."""
+def on_one_core(count, workers):
+    """Keep this process, and so all its threads, to a core of its own; one alone takes what there is."""
+    if workers == 1:
+        return
+    with count.get_lock():
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[count.value % len(cores)]})
+        count.value += 1
+
+
+def row_file(folder, layout, seed, target, arm):
+    """Where the row of a search is kept."""
+    return folder / "rows" / f"{target}-{arm}-{layout}-{seed}.json"
+
+
+def kept(layout, seed, target, arm, folder, film):
+    """Run a search and keep its row; what came of it in a line. An error is a lost search with its reason."""
+    try:
+        row = run(layout, seed, target, arm, folder, film)
+    except Exception as error:
+        row = {"layout": layout, "seed": seed, "target": target, "arm": arm, "retrieved": False, "steps": []}
+        row |= {"why": f"error: {type(error).__name__}: {error}", "trace": traceback.format_exc()}
+    path = row_file(folder, layout, seed, target, arm)
+    # At once or not at all.
     part = path.with_suffix(".part")
     part.write_text(json.dumps(row, default=float))
     part.replace(path)
+    return f"{'retrieved' if row['retrieved'] else 'lost'}: {row['why']}"

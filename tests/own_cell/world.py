@@ -261,7 +261,7 @@ def _xml(things):
         for i, (k, d, e) in enumerate(zip(GAINS, DAMPING, EFFORT, strict=True))
     )
     return f"""<mujoco><compiler angle="radian" eulerseq="xyz"/>
-    <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="10"/>
+    <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="100"/>
     <default><geom solref="0.008 1" solimp="0.95 0.99 0.001"/>
       <default class="still"><geom contype="4" conaffinity="3" friction="0.3 0.003 0.0001" group="1"/></default>
       <default class="thing"><geom contype="2" conaffinity="3" condim="4" group="0"/></default>
