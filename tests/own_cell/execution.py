@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 
 from .limits import PERIOD, each_millisecond
-from .world import BOARD, DAMPING, FRONT, GAINS, STAND
+from .world import BOARD, DAMPING, FRONT, GAINS, STAND, STEP
 
 FINGERS = ("left finger", "right finger")
 PULL = ("all", "hand")
-# Forces are means over so many milliseconds: an impact's single peak depends on the contact's stiffness.
-WINDOW = 10
-# How often it is noted what the hand holds [ms], and how long the arm waits for a hand that still moves [s].
-EVERY, PATIENCE = 20, 3.0
+# Forces are means over so many steps, 10 ms: an impact's single peak depends on the contact's stiffness.
+WINDOW = 5
+# In how many steps it is noted once what the hand holds, and how long the arm waits for a hand that still moves [s].
+EVERY, PATIENCE = 10, 3.0
 # A finger: stiffness [N/m], damping [N s/m]; force of a move without a grip [N]; rest [m/s]; a move's tolerance [m].
 STIFF, DAMP, MOVING_FORCE, REST, REACHED = 4000.0, 80.0, 30.0, 2e-3, 2.5e-3
 SETTLE = 0.6
@@ -39,8 +39,8 @@ class Hand:
         self.width, self.force = (-0.06, event.force) if grasp else (event.width, MOVING_FORCE)
 
     def forces(self, data):
-        """Of both fingers' motors [N]; to be called each millisecond."""
-        step = self.speed * PERIOD
+        """Of both fingers' motors [N]; to be called in each step."""
+        step = self.speed * STEP
         self.wanted += float(np.clip(self.width - self.wanted, -step, step))
         return np.clip(STIFF * (self.wanted / 2 - data.qpos[7:9]) - DAMP * data.qvel[7:9], -self.force, self.force)
 
@@ -76,7 +76,7 @@ class _Watch:
 
     def __init__(self, world, hand, result):
         self.world, self.hand, self.result = world, hand, result
-        # Of each pair of bodies, and of the hand with its fingers, the forces of the last milliseconds and their sum.
+        # Of each pair of bodies, and of the hand with its fingers, the forces of the last steps and their sum.
         self.recent = collections.defaultdict(lambda: (collections.deque([np.zeros(3)] * WINDOW), np.zeros(3)))
         self.foot = {name: pose[0][2] for name, pose in world.poses().items()}
         self.count, self.pull = 0, 0.0
@@ -87,7 +87,7 @@ class _Watch:
         self.watched = self.world.robot_geom | np.isin(self.world.geom_owner, sorted(held))
 
     def step(self):
-        """Advance physics by a millisecond, and note what touches what."""
+        """Advance physics by a step, and note what touches what."""
         world, data = self.world, self.world.data
         data.ctrl[7:9] = self.hand.forces(data)
         mujoco.mj_step(world.model, data)
@@ -102,7 +102,9 @@ class _Watch:
                 self.pull = size
             else:
                 self.result.forces[pair] = max(self.result.forces.get(pair, 0.0), size)
-        for pair in [pair for pair, (kept, _) in self.recent.items() if not any(force.any() for force in kept)]:
+        for pair in [
+            pair for pair in self.recent if pair not in now and not any(f.any() for f in self.recent[pair][0])
+        ]:
             del self.recent[pair]
             self.pull = 0.0 if pair == PULL else self.pull
         self.count += 1
@@ -114,18 +116,18 @@ class _Watch:
         world, data, found = self.world, self.world.data, {}
         geoms = data.contact.geom
         for i in np.flatnonzero(self.watched[geoms].any(axis=1)) if len(geoms) else ():
-            a, b = (str(owner) for owner in world.geom_owner[geoms[i]])
-            robot = world.robot_geom[geoms[i]]
+            one, two = geoms[i]
+            a, b, robot = world.owner[one], world.owner[two], (world.robot_geom[one], world.robot_geom[two])
             local = np.zeros(6)
             mujoco.mj_contactForce(world.model, data, i, local)
             force = data.contact.frame[i].reshape(3, 3).T @ local[:3]
-            if not robot.any() and {a, b} & {"shelf", "stand"} and abs(force[2]) > 0.7 * np.linalg.norm(force):
+            if not any(robot) and {a, b} & {"shelf", "stand"} and abs(force[2]) > 0.7 * np.linalg.norm(force):
                 continue  # what is held stands on something, too
             # MuJoCo's force is the second geom's.
-            if robot[0] or (not robot.any() and a in self.held):
+            if robot[0] or (not any(robot) and a in self.held):
                 a, b, force = b, a, -force
-            pairs = [(b if robot.any() else f"{b} (held)", a)]
-            if robot.any() and b != "arm":
+            pairs = [(b if any(robot) else f"{b} (held)", a)]
+            if any(robot) and b != "arm":
                 pairs.append(PULL)
             for pair in pairs:
                 found[pair] = found.get(pair, 0.0) + force
@@ -176,7 +178,7 @@ def height_above(world, name):
 def rest(world, hand, seconds):
     """Let physics go on with the arm held where it is."""
     watch, q = _Watch(world, hand, Executed()), world.joints
-    for _ in range(int(seconds / PERIOD)):
+    for _ in range(int(seconds / STEP)):
         world.data.ctrl[:7] = q
         watch.step()
 
@@ -195,19 +197,19 @@ def follow(world, hand, rows, events, tracking, force):
     """
     result = Executed()
     watch, before = _Watch(world, hand, result), world.poses()
-    _, q, v = each_millisecond(*rows)
+    _, q, v = (values[:: round(STEP / PERIOD)] for values in each_millisecond(*rows))
     lead = np.array(DAMPING) / np.array(GAINS)
     begun, ended = set(), set()
     at, direction, waited = 0, 1, 0
     while 0 <= at < len(q):
-        seconds = at * PERIOD
+        seconds = at * STEP
         for i, event in enumerate(events):
             if direction == 1 and i not in begun and seconds >= event.start:
                 begun.add(i)
                 hand.begin(event, world.width)
             if direction == 1 and i in begun - ended and seconds >= event.start + event.duration:
                 still = np.abs(world.data.qvel[7:9]).max() < REST
-                if not still and waited < PATIENCE / PERIOD:
+                if not still and waited < PATIENCE / STEP:
                     waited += 1
                     break
                 ended.add(i)
@@ -230,7 +232,7 @@ def follow(world, hand, rows, events, tracking, force):
             break
         at += 0 if paused else direction
     hold = world.joints if not result.ok and 0 <= at < len(q) else q[min(max(at, 0), len(q) - 1)]
-    for _ in range(int(SETTLE / PERIOD)):
+    for _ in range(int(SETTLE / STEP)):
         world.data.ctrl[:7] = hold
         watch.step()
     after = world.poses()

@@ -197,8 +197,8 @@ def draw(frames, path, title):
 
 
 def on_one_core(count, workers):
-    """Keep this process, and so all its threads, to a core of its own; one alone takes what there is."""
-    if workers == 1:
+    """Keep this process, and so all its threads, to a core of its own; one or two take what there is."""
+    if workers <= 2:
         return
     with count.get_lock():
         cores = sorted(os.sched_getaffinity(0))

@@ -15,6 +15,8 @@ from .camera import target_pixels
 
 FRONT, BACK, RIGHT, LEFT, BOARD, CEILING = 0.42, 0.78, -0.30, 0.40, 0.30, 0.70
 THICK = 0.018
+# Of physics [s].
+STEP = 0.002
 # Where the target's foot is to stand in the end: on a stand beside the shelf.
 STAND = (0.32, -0.48, 0.20)
 HOME = np.array([0.0301, -1.4702, 0.0279, -2.4376, 0.1466, 2.3087, 0.7012])
@@ -136,7 +138,8 @@ class World:
         self.model = mujoco.MjModel.from_xml_string(_xml(layout.things))
         self.data = mujoco.MjData(self.model)
         names = [self.model.body(b).name for b in self.model.geom_bodyid]
-        self.geom_owner = np.array([_owner(n or "floor") for n in names])
+        self.owner = [_owner(name) for name in names]
+        self.geom_owner = np.array(self.owner)
         self.things = [thing.name for thing in layout.things]
         self.things_body = [self.model.body(name).id for name in self.things]
         self.robot_geom = np.isin(self.geom_owner, ("arm", "hand", "left finger", "right finger"))
@@ -261,7 +264,7 @@ def _xml(things):
         for i, (k, d, e) in enumerate(zip(GAINS, DAMPING, EFFORT, strict=True))
     )
     return f"""<mujoco><compiler angle="radian" eulerseq="xyz"/>
-    <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="100"/>
+    <option timestep="{STEP}" integrator="implicitfast" cone="elliptic" impratio="100"/>
     <default><geom solref="0.008 1" solimp="0.95 0.99 0.001"/>
       <default class="still"><geom contype="4" conaffinity="3" friction="0.3 0.003 0.0001" group="1"/></default>
       <default class="thing"><geom contype="2" conaffinity="3" condim="4" group="0"/></default>
