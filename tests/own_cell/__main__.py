@@ -21,6 +21,7 @@ def main():
     parser.add_argument("--workers", type=int, default=1, help="processes, of one thread each")
     parser.add_argument("--target", choices=["box", "cylinder"], default="box", help="green box, or white with masks")
     parser.add_argument("--arm", choices=["panda", "fr3"], default="panda")
+    parser.add_argument("--force", type=float, help="on the hand at which the arm stops [N]; each motion's own bound")
     parser.add_argument("--film", action="store_true", help="draw the images of lost searches")
     parser.add_argument("--report", action="store_true", help="only print what there is")
     given = parser.parse_args()
@@ -37,7 +38,7 @@ def main():
         "initargs": (context.Value("i", 0), given.workers),
     }
     with concurrent.futures.ProcessPoolExecutor(given.workers, **settings) as pool:
-        running = {pool.submit(search.kept, *job, *what, given.out, given.film): job for job in jobs}
+        running = {pool.submit(search.kept, *job, *what, given.out, given.force, given.film): job for job in jobs}
         for done in concurrent.futures.as_completed(running):
             print(*running[done], done.result(), flush=True)
     kept = [json.loads(path.read_text()) for path in sorted(rows.glob(f"{given.target}-{given.arm}-*.json"))]

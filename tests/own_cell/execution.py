@@ -51,6 +51,7 @@ class Executed:
 
     Attributes:
       ok: whether arm and hand did all that they were to do.
+      stopped: whether the controller stopped the arm.
       notes: what went wrong, a line each.
       forces: the largest force between two bodies [N], of the robot or what it holds.
       gaps: largest deviation of a joint from its path [rad].
@@ -61,6 +62,7 @@ class Executed:
     """
 
     ok: bool = True
+    stopped: bool = False
     notes: list = dataclasses.field(default_factory=list)
     forces: dict = dataclasses.field(default_factory=dict)
     gap: float = 0.0
@@ -228,10 +230,10 @@ def follow(world, hand, rows, events, tracking, force):
         if gap > tracking or watch.pull > force:
             what = f"a joint is {gap:.3f} rad off its path" if gap > tracking else f"{watch.pull:.0f} N on the hand"
             result.notes.append(f"the controller stopped the arm at {seconds:.2f} s: {what}")
-            result.ok = False
+            result.ok, result.stopped = False, True
             break
         at += 0 if paused else direction
-    hold = world.joints if not result.ok and 0 <= at < len(q) else q[min(max(at, 0), len(q) - 1)]
+    hold = world.joints if result.stopped else q[min(max(at, 0), len(q) - 1)]
     for _ in range(int(SETTLE / STEP)):
         world.data.ctrl[:7] = hold
         watch.step()

@@ -20,7 +20,7 @@ TOUCH, BESIDE = 5.0, 0.04
 MOST_ACTIONS = 16
 
 
-def run(layout, seed, target, arm, folder, film=False):
+def run(layout, seed, target, arm, folder, force=None, film=False):
     """Run the search of one layout and seed, and return its row, a dictionary of JSON values."""
     from mechsearch_jax.envs.cell.loading import load_searcher
     from mechsearch_jax.robot.trajectory_files import save_csv
@@ -68,11 +68,10 @@ def run(layout, seed, target, arm, folder, film=False):
         path = files / f"{actions:02d}.csv"
         save_csv(step.trajectory, path, overwrite=True)
         note["limits"], note["shares"] = limits.faults(path, arm, cell.joints)
-        moved = step.trajectory
-        bounds = moved.bounds
+        bounds = step.trajectory.bounds
         rows = limits.read_csv(path)[:3]
         note["duration"] = round(float(rows[0][-1]), 1)
-        done = execution.follow(cell, hand, rows, moved.events, bounds.tracking, bounds.force)
+        done = execution.follow(cell, hand, rows, step.trajectory.events, bounds.tracking, force or bounds.force)
         note["executed"] = {
             "ok": bool(done.ok),
             "notes": done.notes,
@@ -85,7 +84,10 @@ def run(layout, seed, target, arm, folder, film=False):
             "forces": {"|".join(pair): round(size, 1) for pair, size in done.forces.items() if size > 0.5},
         }
         note["unannounced"] = unannounced(note, done)
-        searcher.acted(done.ok, **offered(searcher.acted, cell, hand))
+        state = offered(searcher.acted, cell)
+        searcher.acted(done.ok, **state)
+        if done.stopped and not state:
+            return end(f"{done.notes[-1]}, and the searcher cannot be told where it stands")
         if seconds_out := taken_out(cell, done):
             return end(seconds_out, True)
         if "target" in done.dropped:
@@ -98,7 +100,7 @@ def run(layout, seed, target, arm, folder, film=False):
             return end(f"not out after {actions} actions")
 
 
-def offered(function, cell, hand):
+def offered(function, cell):
     """What a function takes of the arm's and the hand's state."""
     known = {"width": cell.width, "joints": cell.joints}
     return {name: value for name, value in known.items() if name in inspect.signature(function).parameters}
@@ -211,10 +213,10 @@ def row_file(folder, layout, seed, target, arm):
     return folder / "rows" / f"{target}-{arm}-{layout}-{seed}.json"
 
 
-def kept(layout, seed, target, arm, folder, film):
+def kept(layout, seed, target, arm, folder, force, film):
     """Run a search and keep its row; what came of it in a line. An error is a lost search with its reason."""
     try:
-        row = run(layout, seed, target, arm, folder, film)
+        row = run(layout, seed, target, arm, folder, force, film)
     except Exception as error:
         row = {"layout": layout, "seed": seed, "target": target, "arm": arm, "retrieved": False, "steps": []}
         row |= {"why": f"error: {type(error).__name__}: {error}", "trace": traceback.format_exc()}
