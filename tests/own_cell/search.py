@@ -17,7 +17,7 @@ LOOKS = 3
 # Contacts beyond this are counted [N], and results are "out" so close to the stand's place [m].
 TOUCH, BESIDE = 5.0, 0.04
 # A search that does not end has failed.
-MOST_ACTIONS = 16
+MOST_MOTIONS = 24
 
 
 def run(layout, seed, target, arm, folder, force=None, film=False):
@@ -35,7 +35,7 @@ def run(layout, seed, target, arm, folder, force=None, film=False):
     execution.rest(cell, hand, 0.5)
     rng = np.random.default_rng([layout, seed, 7])
     row = {"layout": layout, "seed": seed, "target": target, "arm": arm, "retrieved": False, "why": "", "steps": []}
-    frames, refused, actions = [], 0, 0
+    frames, refused, motions, actions = [], 0, 0, 0
     masks = target == "cylinder"
 
     def end(why, retrieved=False):
@@ -60,12 +60,16 @@ def run(layout, seed, target, arm, folder, force=None, film=False):
         note.update(told(step, cell) if step else {"kind": "refused", "reason": fault})
         frames.append((colour, depth, f"{note['kind']}: {note['reason']}"))
         if step is None or step.trajectory is None:
+            # Who reads that the hand may hold the target looks, and says so.
+            if "acted(ok=True)" in note["reason"] and "target" in seen["held"]:
+                searcher.acted(True)
+                return end(taken_out(cell) or "the hand holds the target inside the shelf", bool(taken_out(cell)))
             refused += 1
             if refused > LOOKS:
                 return end(f"refused: {note['reason']}")
             continue
-        refused, actions = 0, actions + 1
-        path = files / f"{actions:02d}.csv"
+        refused, motions, actions = 0, motions + 1, actions + (step.kind != "withdraw")
+        path = files / f"{motions:02d}.csv"
         save_csv(step.trajectory, path, overwrite=True)
         note["limits"], note["shares"] = limits.faults(path, arm, cell.joints)
         bounds = step.trajectory.bounds
@@ -74,6 +78,7 @@ def run(layout, seed, target, arm, folder, force=None, film=False):
         done = execution.follow(cell, hand, rows, step.trajectory.events, bounds.tracking, force or bounds.force)
         note["executed"] = {
             "ok": bool(done.ok),
+            "stopped": done.stopped,
             "notes": done.notes,
             "gap": round(done.gap, 4),
             "grasps": done.grasps,
@@ -84,36 +89,29 @@ def run(layout, seed, target, arm, folder, force=None, film=False):
             "forces": {"|".join(pair): round(size, 1) for pair, size in done.forces.items() if size > 0.5},
         }
         note["unannounced"] = unannounced(note, done)
-        state = offered(searcher.acted, cell)
-        searcher.acted(done.ok, **state)
-        if done.stopped and not state:
+        told_joints = "joints" in inspect.signature(searcher.acted).parameters
+        searcher.acted(done.ok, **({"joints": cell.joints} if done.stopped and told_joints else {}))
+        if done.stopped and not told_joints:
             return end(f"{done.notes[-1]}, and the searcher cannot be told where it stands")
-        if seconds_out := taken_out(cell, done):
-            return end(seconds_out, True)
         if "target" in done.dropped:
             return end(f"the target was dropped: {done.dropped['target']}")
-        if "target" not in done.held and cell.poses()["target"][0][0] < world.FRONT - 0.02:
-            return end("the target fell out of the shelf")
+        out = taken_out(cell)
         if searcher.finished:
-            return end("the searcher took the target to be out, which it is not")
-        if actions >= MOST_ACTIONS:
-            return end(f"not out after {actions} actions")
+            return end(out or "the searcher takes the target to be out, which it is not", bool(out))
+        if "target" not in done.held and cell.poses()["target"][0][0] < world.FRONT - 0.02:
+            return end("the target is out, which the searcher does not know" if out else "the target fell out")
+        if motions >= MOST_MOTIONS:
+            return end(f"not out after {motions} motions")
 
 
-def offered(function, cell):
-    """What a function takes of the arm's and the hand's state."""
-    known = {"width": cell.width, "joints": cell.joints}
-    return {name: value for name, value in known.items() if name in inspect.signature(function).parameters}
-
-
-def taken_out(cell, done):
+def taken_out(cell):
     """Where the target is if it is outside, held or put down; empty if it is not."""
     place, turned = cell.poses()["target"]
-    if "target" in done.held:
+    if "target" in execution.held_things(cell):
         return "held outside" if place[0] < world.FRONT - 0.05 else ""
     off = math.dist(place[:2], world.STAND[:2])
     stands = abs(execution.height_above(cell, "target")) < 0.01 and turned[2, 2] > 0.95
-    return f"put down, {1000 * off:.0f} mm from its place" if off < BESIDE and stands and not done.dropped else ""
+    return f"put down, {1000 * off:.0f} mm from its place" if off < BESIDE and stands else ""
 
 
 def told(step, cell):
@@ -138,7 +136,7 @@ def told(step, cell):
         slots = {o["slot"]: o["is"] for o in objects}
         of = "target" if kind == "retrieve" else slots.get(action["object"], "target")
     cost, expected = values["cost"], values["predicted_cost"]
-    moves = step.trajectory is not None and kind != "retrieve"
+    moves = step.trajectory is not None and kind in ("push", "pick-and-place")
     target = values["target"]
     return {
         "kind": kind,
@@ -192,8 +190,8 @@ def draw(frames, path, title):
         left.set_title("\n".join(text[i : i + 150] for i in range(0, len(text), 150)), fontsize=7, loc="left")
         left.axis("off")
         right.axis("off")
-    figure.suptitle(title, fontsize=9)
-    figure.tight_layout()
+    figure.suptitle(title[:150], fontsize=9)
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.3 / figure.get_figheight()))
     figure.savefig(path, dpi=70)
     plt.close(figure)
 
