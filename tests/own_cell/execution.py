@@ -19,6 +19,8 @@ EVERY, PATIENCE = 10, 3.0
 # A finger: stiffness [N/m], damping [N s/m]; force of a move without a grip [N]; rest [m/s]; a move's tolerance [m].
 STIFF, DAMP, MOVING_FORCE, REST, REACHED = 4000.0, 80.0, 30.0, 2e-3, 2.5e-3
 SETTLE = 0.6
+# With less force than this at a point, what is held only stands on the board or its stand [N].
+WEIGHT = 5.0
 # A thing that is let go so far above what is below it is dropped [m].
 DROP = 0.02
 
@@ -123,7 +125,7 @@ class _Watch:
             local = np.zeros(6)
             mujoco.mj_contactForce(world.model, data, i, local)
             force = data.contact.frame[i].reshape(3, 3).T @ local[:3]
-            if not any(robot) and {a, b} & {"shelf", "stand"} and abs(force[2]) > 0.7 * np.linalg.norm(force):
+            if not any(robot) and {a, b} & {"shelf", "stand"} and 0.7 * np.linalg.norm(force) < abs(force[2]) < WEIGHT:
                 continue  # what is held stands on something, too
             # MuJoCo's force is the second geom's.
             if robot[0] or (not any(robot) and a in self.held):

@@ -28,9 +28,16 @@ def run(layout, seed, target, arm, folder, force=None, film=False):
 
     files = folder / "files" / f"{target}-{layout}-{seed}"
     files.mkdir(parents=True, exist_ok=True)
-    (files / "cell.toml").write_text(setup.configuration(target, arm))
     begun = time.monotonic()
-    searcher = load_searcher(files / "cell.toml", seed=seed)
+    try:
+        (files / "cell.toml").write_text(setup.configuration(target, arm, obstacles=True))
+        searcher = load_searcher(files / "cell.toml", seed=seed)
+    except InputError as error:
+        # A package that knows no obstacles cannot be told of them.
+        if "obstacle" not in str(error):
+            raise
+        (files / "cell.toml").write_text(setup.configuration(target, arm))
+        searcher = load_searcher(files / "cell.toml", seed=seed)
     cell, hand = world.World(world.drawn_layout(layout, target)), execution.Hand()
     execution.rest(cell, hand, 0.5)
     rng = np.random.default_rng([layout, seed, 7])

@@ -5,8 +5,25 @@ from . import camera, world
 SPEED = 0.3
 
 
-def configuration(target="box", arm="panda", seed=0):
-    """Text of the configuration file: a green box, or a white cylinder, of which masks tell."""
+def configuration(target="box", arm="panda", obstacles=False):
+    """Text of the configuration file: a green box, or a white cylinder, of which masks tell.
+
+    With `obstacles` it names the camera's post and the stand on which the target is put down.
+    """
+    x, y, z = world.STAND
+    high = camera.PLACE[2] - 0.0125
+    named = f"""
+[[obstacle]]
+name = "post"
+shape = "cylinder"
+size = [0.03, 0.03, {high}]
+position = [{camera.PLACE[0] - 0.02}, {camera.PLACE[1]}, {high / 2}]
+
+[[obstacle]]
+name = "stand"
+size = [0.14, 0.14, {z}]
+position = [{x}, {y}, {z / 2}]
+"""
     rows = ", ".join(f"[{', '.join(f'{v:.9f}' for v in row)}]" for row in camera.rotation())
     sought = {
         "box": 'shape = "box"\nhalf_size = [0.0225, 0.0175, 0.055]\nyaws = 6\ncolour = [0.10, 0.62, 0.22]',
@@ -38,4 +55,4 @@ thickness = {world.THICK}
 model = "{arm}"
 speed = {SPEED}
 place = [{", ".join(str(v) for v in world.STAND)}]
-"""
+{named if obstacles else ""}"""
