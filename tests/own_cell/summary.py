@@ -1,0 +1,71 @@
+"""What came of searches, as a table of counts with Wilson intervals."""
+
+import math
+
+
+def wilson(hits, of, z=1.96):
+    """Bounds of the 95% interval of a share."""
+    if of == 0:
+        return 0.0, 1.0
+    share, spread = hits / of, z * z / of
+    middle = (share + spread / 2) / (1 + spread)
+    half = z / (1 + spread) * math.sqrt(share * (1 - share) / of + spread / (4 * of))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def table(rows):
+    """Counts of searches, looks and motions, and the reason of each that was lost, as Markdown."""
+    steps = [step for row in rows for step in row["steps"]]
+    motions = [step for step in steps if "executed" in step]
+    searches_with = lambda test: sum(any(test(step) for step in row["steps"]) for row in rows)  # noqa: E731
+    dropped = lambda step: "target" in step.get("executed", {}).get("dropped", {})  # noqa: E731
+    refused = [step for step in steps if "executed" not in step]
+    counts = [
+        ("retrieved", sum(row["retrieved"] for row in rows), len(rows), "at least 36 of 40"),
+        ("searches in which the held target was dropped", searches_with(dropped), len(rows), "0"),
+        ("motions without expected gain", sum(step["without_gain"] for step in motions), len(motions), "0"),
+        (
+            "motions with an unannounced contact above 5 N",
+            sum(bool(s["unannounced"]) for s in motions),
+            len(motions),
+            "0",
+        ),
+        ("files that a controller would refuse", sum(bool(step["limits"]) for step in motions), len(motions), "0"),
+        ("looks refused", len(refused), len(steps), ""),
+        ("grasps failed with a thing between the fingers", sum(_wrong(step) for step in motions), len(motions), ""),
+        ("motions stopped by the controller", sum(_stopped(step) for step in motions), len(motions), ""),
+    ]
+    lines = ["| | count | of | 95% interval | wanted |", "|---|---|---|---|---|"]
+    for name, hits, of, wanted in counts:
+        low, high = wilson(hits, of)
+        lines.append(f"| {name} | {hits} | {of} | {100 * low:.0f} to {100 * high:.0f}% | {wanted} |")
+    touched = sorted(
+        (
+            (size, pair, row)
+            for row in rows
+            for step in row["steps"]
+            for pair, size in step.get("unannounced", {}).items()
+        ),
+        key=lambda t: -t[0],
+    )
+    if touched:
+        size, pair, row = touched[0]
+        lines.append(f"\nLargest unannounced contact: {size} N, {pair}, layout {row['layout']}, seed {row['seed']}.")
+    lines += ["", "| layout | seed | actions | looks | s | what came of it |", "|---|---|---|---|---|---|"]
+    for row in sorted(rows, key=lambda r: (r["layout"], r["seed"])):
+        lines.append(
+            f"| {row['layout']} | {row['seed']} | {row.get('actions', '')} | {len(row['steps'])} | "
+            f"{row.get('seconds', '')} | {'' if row['retrieved'] else '**lost** '}{row['why'][:300]} |"
+        )
+    return "\n".join(lines)
+
+
+def _wrong(step):
+    return any(
+        g["between"] and not g["expected"] - g["inner"] <= g["measured"] <= g["expected"] + g["outer"]
+        for g in step["executed"]["grasps"]
+    )
+
+
+def _stopped(step):
+    return any("stopped the arm" in note for note in step["executed"]["notes"])
