@@ -1,4 +1,4 @@
-"""At which poses of the target no grasp is possible in an empty shelf, why, and whether another tilt of the hand helps."""
+"""At which of the target's poses no grasp is possible in an empty shelf, why, and whether other tilts would help."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def lost_poses(problem: Problem) -> Iterator[str]:
         config = dataclasses.replace(problem.config.grasps, tilts=tuple(np.deg2rad(OTHER_TILTS).tolist()))
         able = _able(problem, grasp_tables(problem.gripper, problem.target, config))
         yield (
-            f"a hand that points down by {OTHER_TILTS[0]} to {OTHER_TILTS[-1]}° instead of {low} to {high}° could grasp it "
-            f"at {able(problem.shelf, lost).sum() or 'none'} of these {len(lost)}"
+            f"a hand that points down by {OTHER_TILTS[0]} to {OTHER_TILTS[-1]}° instead of {low} to {high}° could grasp"
+            f" it at {able(problem.shelf, lost).sum() or 'none'} of these {len(lost)}"
         )
 
 
