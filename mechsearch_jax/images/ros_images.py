@@ -52,7 +52,7 @@ def mask_of(image: Any) -> Int[np.ndarray, "h w"]:
     Raises:
       InputError: as `depth_of`.
     """
-    return _pixels(image, MASK)[..., 0]
+    return _pixels(image, MASK)[..., 0].astype(np.int32)
 
 
 def lens_of(info: Any, camera: Camera, rectified: bool = False) -> Lens:
