@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from mechsearch_jax.geometry.transforms import compose
-from mechsearch_jax.grasping.graspability import GraspTables, feasible_grasps, grasp_tables
+from mechsearch_jax.grasping.graspability import CandidateGrasps, GraspTables, feasible_grasps, grasp_tables
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -55,7 +55,7 @@ def _causes(problem: Problem, lost: Int[np.ndarray, " n"]) -> dict[str, Int[np.n
     return {why: rows for why, rows in causes.items() if len(rows)}
 
 
-def _from_the_front(tables: GraspTables, rows: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _from_the_front(tables: CandidateGrasps, rows: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """At which poses a grasp comes from the front."""
     T = compose(tables.T_world_target[rows][:, None], tables.T_target_gripper[None])
     x, y = np.moveaxis(np.asarray(T)[..., :2, 2], -1, 0)
@@ -69,7 +69,7 @@ def _able(problem: Problem, tables: GraspTables) -> Able:
         # Few shapes are compiled.
         poses = problem.grasps.T_world_target[np.resize(rows, 1 << len(rows).bit_length())]
         feasible = _feasible(tables, shelf, problem.gripper, problem.config.grasps, poses)
-        return np.asarray(feasible).any(axis=1)[: len(rows)]
+        return np.any(np.asarray(feasible)[: len(rows)], axis=1)
 
     return able
 
