@@ -338,15 +338,22 @@ def search(node, searcher, confirm=lambda step: True, ask=lambda reason: False):
     )
 
 
-def agreed(question):
-    """Whether the operator says yes."""
-    return input(f"{question} [y/N] ").strip().lower() == "y"
-
-
 def confirmed(step):
     """Whether the operator agrees to a motion."""
     print(f"{step.kind}: {step.reason}\n{step.trajectory.report()}")
-    return agreed("Move?")
+    return input("Move? [y/N] ").strip().lower() == "y"
+
+
+def asked(searcher):
+    """A function that asks whether to look again; the operator may also say that the hand has the target."""
+
+    def ask(reason):
+        answer = input("Look again? [y/N, t: the target is in the hand] ").strip().lower()
+        if answer == "t":
+            searcher.acted()
+        return answer in ("y", "t")
+
+    return ask
 
 
 def main():
@@ -368,7 +375,7 @@ def main():
         mask = bool(node.given["mask"])
         kinds = {"colour": True, "mask": mask, "target_id": mask and node.given["target_id"] >= 0}
         searcher.warm_up(lambda what, left: node.get_logger().info(f"preparing {what}"), **kinds)
-        asking = (confirmed, lambda reason: agreed("Look again?")) if node.given["confirm"] else ()
+        asking = (confirmed, asked(searcher)) if node.given["confirm"] else ()
         retrieved = search(node, searcher, *asking)
         node.get_logger().info("the target is out" if retrieved else "the search ended without the target")
     finally:

@@ -36,7 +36,7 @@ def run_search(
       follow: moves the robot, and returns whether that went well. Whatever it raises, the searcher is told that the
         motion failed.
       ask: called with the reason after every `looks` looks in a row without a motion; whether to look again. A person
-        may meanwhile have mended what it says.
+        may meanwhile have mended what it says, or called `searcher.acted()` where the target is in the hand.
       confirm: whether a step's motion may be made; if not, the search ends.
       tell: called with each step's kind and reason, and with each of its warnings.
       state: file in which the search is kept after each step. One that is there is gone on with; a motion that had
@@ -72,8 +72,10 @@ def run_search(
             tell(f"warning: {warning}")
         if step is None or step.trajectory is None:
             refused += 1
-            if refused % looks == 0 and not ask(reason):
-                return False
+            if refused % looks == 0:
+                if not ask(reason):
+                    return False
+                keep()
             continue
         if not confirm(step):
             return False
