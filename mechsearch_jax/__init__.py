@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.config.presets import standard as standard
     from mechsearch_jax.geometry.superquadric import Superquadrics as Superquadrics
     from mechsearch_jax.images.examples import example_images as example_images
+    from mechsearch_jax.images.measured import median_depth as median_depth
     from mechsearch_jax.observation import Observation as Observation
     from mechsearch_jax.perception.recogniser import Recogniser as Recogniser
     from mechsearch_jax.planner.policies import (
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.robot.gripper import Gripper as Gripper
     from mechsearch_jax.robot.hand import HandConfig as HandConfig
     from mechsearch_jax.runtime.errors import InputError as InputError
+    from mechsearch_jax.session.loop import run_search as run_search
     from mechsearch_jax.session.searcher import Searcher as Searcher
     from mechsearch_jax.session.whole_trajectory import whole_trajectory as whole_trajectory
     from mechsearch_jax.workspace.camera import Camera as Camera
@@ -86,7 +88,9 @@ _ROOMS = {
     "keep_compilations": "problem.cache",
     "load_scenario": "workspace.scenario",
     "load_settings": "problem.settings",
+    "median_depth": "images.measured",
     "paper": "config.presets",
+    "run_search": "session.loop",
     "search_and_grasp": "planner.policies",
     "search_for_grasp": "planner.policies",
     "standard": "config.presets",

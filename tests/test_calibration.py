@@ -13,6 +13,7 @@ from mechsearch_jax.calibration.check import check_holds, check_in_sight, placem
 from mechsearch_jax.calibration.fit import FEW_PIXELS, LEVER, fit_shelf
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.calibration.report import correction, report
+from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.cell.calibrate import _write_values
 from mechsearch_jax.images.camera_pose import with_pose
 from mechsearch_jax.images.examples import example_images
@@ -24,6 +25,7 @@ from mechsearch_jax.workspace.camera import rays
 from mechsearch_jax.workspace.shelf import Shelf
 
 IMAGES, SHELF = example_images(), Shelf()
+PLACES = ("front", "back", "right", "left", "board", "ceiling")
 CAMERA, DEPTH = IMAGES.camera, IMAGES.depth
 
 
@@ -40,6 +42,13 @@ def off_by(shift, axis=(0.0, 0.0, 1.0), degrees=0.0):
     T[:3, :3] = turned(axis, np.radians(degrees)) @ np.array(CAMERA.rotation)
     T[:3, 3] = np.add(CAMERA.position, shift)
     return with_pose(CAMERA, T)
+
+
+def cell(folder, shelf=SHELF):
+    """The arguments of a configuration that says where a shelf is."""
+    file = folder / "cell.toml"
+    file.write_text("[shelf]\n" + "".join(f"{name} = {getattr(shelf, name)}\n" for name in PLACES))
+    return "--config", str(file)
 
 
 def between(camera, other):
@@ -149,7 +158,7 @@ def test_pixels_that_are_far_off_move_nothing(values, pixels):
 def test_a_camera_is_not_corrected_by_a_fit_that_does_not_hold(depth, words, tmp_path, monkeypatch):
     np.save(tmp_path / "depth.npy", depth)
     save_camera(CAMERA, tmp_path / "camera.json")
-    files = ("--depth", str(tmp_path / "depth.npy"), "--camera", str(tmp_path / "camera.json"))
+    files = ("--depth", str(tmp_path / "depth.npy"), "--camera", str(tmp_path / "camera.json"), *cell(tmp_path))
     (tmp_path / "out.json").write_text("mine")
     code, said = program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "out.json"))
     assert code != 0
@@ -209,7 +218,7 @@ def test_a_look_warns_of_a_face_that_is_not_where_the_others_put_it(change):
 def test_a_camera_file_is_corrected(tmp_path, monkeypatch, capsys):
     save_depth(DEPTH, tmp_path / "depth.png")
     save_camera(off_by((0.01, -0.01, 0.01), degrees=1.0), tmp_path / "camera.json")
-    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"), *cell(tmp_path))
     for name in ("new.json", "new.toml"):
         status, message = program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / name))
         assert (status, message) == (0, "")
@@ -224,11 +233,30 @@ def test_a_camera_file_is_corrected(tmp_path, monkeypatch, capsys):
     )
 
 
+def test_without_a_shelf_of_its_own_nothing_is_measured(tmp_path, monkeypatch, capsys):
+    save_depth(DEPTH, tmp_path / "depth.png")
+    save_camera(CAMERA, tmp_path / "camera.json")
+    (tmp_path / "mine.toml").write_text("[shelf]\nfront = 0.414\n")
+    (tmp_path / "out.json").write_text("mine")
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
+    arguments = (*files, "--out", str(tmp_path / "out.json"))
+    for config, words in (
+        ((), "there is no --config"),
+        (("--config", str(tmp_path / "mine.toml")), "has no back, right"),
+    ):
+        status, message = program(monkeypatch, "calibrate", *arguments, *config)
+        assert (status, words in message, len(message.splitlines())) == (2, True, 1)
+    assert (tmp_path / "out.json").read_text() == "mine"
+    cli.parse(["calibrate", *files, *cell(tmp_path)])()
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith(f"{tmp_path / 'cell.toml'}: the shelf in the robot's frame: front 0.414, back 0.788")
+
+
 def test_images_of_a_lens_that_distorts_are_undistorted_and_the_lens_is_kept(tmp_path, monkeypatch):
     D = (-0.12, 0.02, 0.001, -0.0005, 0.0)
     save_depth(raw(DEPTH, CAMERA, D), tmp_path / "depth.png")
     save_camera(off_by((0.01, -0.01, 0.01), degrees=1.0), tmp_path / "camera.json", D)
-    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"), *cell(tmp_path))
     assert program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "new.json")) == (0, "")
     lens = load_lens(tmp_path / "new.json")
     assert lens.distortion == D
@@ -279,7 +307,7 @@ def test_a_configuration_is_corrected_and_its_comments_stay(tmp_path, monkeypatc
     position = np.add(taken.position, (0.1, 0.0, -0.2)).tolist()
     # The shelf's place is in the file's frame, too.
     shelf = SHELF.moved((0.1, 0.0, -0.2))
-    places = {name: getattr(shelf, name) for name in ("front", "back", "right", "left", "board", "ceiling")}
+    places = {name: getattr(shelf, name) for name in PLACES}
     table = "[shelf]\n" + "".join(f"{name} = {value}\n" for name, value in places.items())
     ranges = f"spawn_x = {list(shelf.spawn_x)}\nspawn_y = {list(shelf.spawn_y)}\n"
     config = CONFIG.format(rows=rows, position=position) + "\n" + table + ranges
@@ -313,22 +341,11 @@ def test_the_place_of_the_shelf_is_corrected(tmp_path, monkeypatch):
     save_depth(DEPTH, tmp_path / "depth.png")
     save_camera(CAMERA, tmp_path / "camera.json")
     wrong = SHELF.moved((0.01, -0.015, 0.008))
-    names = ("front", "back", "right", "left", "board", "ceiling")
-    text = "[shelf]\n" + "".join(f"{name} = {getattr(wrong, name)}\n" for name in names)
-    (tmp_path / "mine.toml").write_text(text)
-    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
-    arguments = (
-        *files,
-        "--config",
-        str(tmp_path / "mine.toml"),
-        "--moved",
-        "shelf",
-        "--out",
-        str(tmp_path / "new.toml"),
-    )
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"), *cell(tmp_path, wrong))
+    arguments = (*files, "--moved", "shelf", "--out", str(tmp_path / "new.toml"))
     assert program(monkeypatch, "calibrate", *arguments) == (0, "")
     corrected = load_settings(tmp_path / "new.toml").workcell.shelf
-    assert all(getattr(corrected, name) == pytest.approx(getattr(SHELF, name), abs=0.001) for name in names)
+    assert all(getattr(corrected, name) == pytest.approx(getattr(SHELF, name), abs=0.001) for name in PLACES)
 
 
 @pytest.mark.parametrize(

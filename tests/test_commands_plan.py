@@ -2,11 +2,15 @@
 
 import csv
 import dataclasses
+import io
 import json
+import types
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from stage import HIDDEN, OPEN, grab
 from test_mutated_files import program
 from test_search import IMAGES, TRUSTING, seen
@@ -25,7 +29,7 @@ from mechsearch_jax.images.image_files import (
 from mechsearch_jax.problem import problem as problems
 from mechsearch_jax.problem.problem import NOWHERE
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.session.searcher import Searcher
+from mechsearch_jax.session.searcher import Check, Searcher
 
 WRITTEN = {"step.json", "step.png", "trajectory.csv", "trajectory.json"}
 FILES = {"depth.png", "colour.png", "mask.png", "camera.json"}
@@ -152,3 +156,11 @@ def test_a_search_goes_on_from_call_to_call(see, tmp_path, monkeypatch, capsys):
     before = (out / "step.json").read_bytes()
     assert program(monkeypatch, *command)[0] == 0
     assert (out / "step.json").read_bytes() == before
+
+
+def test_brackets_in_a_message_stay_in_the_terminal():
+    written = io.StringIO()
+    step = types.SimpleNamespace(kind="none", reason="say so in [arm]", warnings=("check [target]",), trajectory=None)
+    plan._report(Console(file=written), step, Check(1.0, ("see [camera]",), ("no [bold]",)), [Path("[out]/step.json")])
+    for words in ("say so in [arm]", "check [target]", "see [camera]", "no [bold]", "[out]/step.json"):
+        assert words in written.getvalue()

@@ -1,5 +1,6 @@
 """The guides: their links lead somewhere, their code runs, and what the source cites of them is there."""
 
+import ast
 import importlib.util
 import json
 import math
@@ -102,7 +103,7 @@ def test_files_that_a_page_names_are_there(page):
 def test_what_the_python_guides_name_of_modules_is_there():
     package, count = ROOT / "mechsearch_jax", 0
     rooms = {path.stem for path in package.iterdir()} | set(SOURCE)
-    guides = "\n".join(read(f"docs/{name}.md") for name in ("python", "extend", "camera"))
+    guides = "\n".join(read(f"docs/{name}.md") for name in ("python", "extend", "camera", "robot"))
     for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", guides):
         folders = [folder for folder in path.strip(".").split(".") if folder != "mechsearch_jax"]
         if folders and folders[0] in rooms:
@@ -127,6 +128,21 @@ def test_the_api_pages_hold_all_of_the_front_door():
     shown = re.findall(r"^::: mechsearch_jax\.([\w.]+)\.(\w+)$", pages, re.MULTILINE)
     assert len(shown) == len(set(shown))
     assert set(mechsearch_jax._ROOMS.items()) <= {(name, room) for room, name in shown}
+
+
+def test_what_the_robots_page_explains_is_said():
+    said = [
+        part.value
+        for file in (ROOT / "mechsearch_jax").rglob("*.py")
+        for part in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(part, ast.Constant) and isinstance(part.value, str)
+    ]
+    headers = ("| it begins with | what it means | what to do |", "| it says | what to do |")
+    cells = [row[0] for header in headers for row in rows("docs/robot.md", header)]
+    texts = [text for cell in cells for text in re.findall("`(.*?)`", cell)]
+    assert len(texts) > 30
+    for piece in {piece for text in texts for piece in text.split("…") if len(piece) > 3}:
+        assert any(piece.strip() in one for one in said), piece
 
 
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():

@@ -2,9 +2,11 @@
 
 import dataclasses
 import importlib.metadata
+import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from mechsearch_jax.commands import main as cli
@@ -107,7 +109,17 @@ def test_the_default_cell_is_fine(problem, monkeypatch):
     findings = cell_of(problem, monkeypatch)
     assert {finding.state for part in findings.values() for finding in part} == {State.FINE}
     assert "sees 100% of the board" in findings["camera"][0].says
-    assert "can grasp the target at 95% of its 792" in findings["shelf"][0].says
+    share, *lost, tilts = (finding.says for finding in findings["shelf"])
+    assert "can grasp the target at 95% of its 792" in share
+    # The walls are alike, and keep the hand from the row of poses beside each.
+    counts = [
+        int(re.match(r"not at (\d+) of them: the (?:back|right|left) wall is in the way", one)[1]) for one in lost
+    ]
+    assert counts[1] == counts[2] == 18
+    assert "of the board's front left 7%, middle left 7%, back left 7%" in lost[2]
+    assert sum(counts) == 792 - len(np.unique(problem.grasps.pair_pose))
+    assert re.search(rf"down by 0 to 60° instead of 20 to 30° could grasp it at \d of these {sum(counts)}$", tilts)
+    assert "told by its colour, red 0.7282" in findings["target"][0].says
     assert "recognition and segmentation" in findings["networks"][0].says
     assert "trials physics, push model learned, at most 10 actions" in findings["planner"][0].says
 

@@ -1,5 +1,7 @@
 """A search that is shown while it runs: what is on the page, and that nothing of the search changes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,9 @@ from test_search import IMAGES, searcher_of, seen
 
 from mechsearch_jax.actions import retrieve_action
 from mechsearch_jax.envs.recording.evidence import evidence_without_truth
+from mechsearch_jax.envs.recording.recording import Recording
+from mechsearch_jax.envs.recording.step_pictures import Painter
+from mechsearch_jax.envs.recording.step_values import trouble
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision
@@ -110,6 +115,13 @@ def test_every_look_is_a_step_of_its_own(problem, view):
     assert view.viewer.count == 2
     assert step.reason in view.viewer.text
     assert "2. nothing to be done" in view.viewer.text
+    # Nobody knows where the target is: it has not fallen, and the map from above shows where it can be.
+    recording = Recording("", problem.camera, problem.shelf, problem.target, tuple(view._steps))
+    assert [trouble(recording, shown) for shown in recording.steps] == [None, None]
+    assert "fell" not in view.viewer.text
+    empty = dataclasses.replace(step.frame, existence=np.zeros_like(step.frame.existence))
+    without_f = Painter(recording).believed(recording.steps[1], empty)
+    assert np.mean((view.viewer.pictures["above"] != without_f).any(axis=-1)) > 0.01
     cells = node(view.viewer._server, "/map/1/cells").batched_positions
     assert len(cells) >= int(step.belief.exists.sum()) / problem.target.yaws
 

@@ -14,6 +14,7 @@ import pytest
 from test_search_whole_trajectory import pushed, taken
 
 from mechsearch_jax.images.lens import Lens
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 
 NODE = Path(__file__).parents[1] / "examples" / "ros2" / "search_node.py"
@@ -206,7 +207,7 @@ def start(monkeypatch):
     """A node of the example, and its stand-in."""
 
     def started(**parameters):
-        stand_in = StandIn(**{"robot": "fr3", **parameters})
+        stand_in = StandIn(**{"robot": "fr3", "frames": 1, **parameters})
         for name, module in stand_in.modules():
             monkeypatch.setitem(sys.modules, name, module)
         spec = importlib.util.spec_from_file_location("search_node", NODE)
@@ -287,9 +288,9 @@ def test_old_images_and_missing_ones_are_not_taken(start):
     with pytest.raises(TimeoutError, match="are the topics right"):
         node.look(5.0)
     published(stand_in, seconds=6)
-    depth, colour = node.look(5.0)
-    assert (depth.shape, colour.shape) == ((3, 4), (3, 4, 3))
-    assert depth[0, 0] == pytest.approx(1.5)
+    look = node.look(5.0)
+    assert {name: image.shape for name, image in look.items()} == {"depth": (3, 4), "colour": (3, 4, 3)}
+    assert look["depth"][0, 0] == pytest.approx(1.5)
     assert node.joints == HERE
     assert node.width == pytest.approx(0.03)
 
@@ -442,7 +443,7 @@ def test_the_node_cancels_before_it_shuts_down(start, monkeypatch):
     stand_in.answers["grasp"] = INTERRUPTED
     trajectory, interrupted = taken(), []
 
-    def search(node, searcher, confirm):
+    def search(node, searcher, confirm=lambda step: True):
         node._begin_event(trajectory.events[-1])
         interrupted.append(confirm(None))
         raise KeyboardInterrupt
@@ -482,7 +483,9 @@ def test_an_arm_that_stops_ends_it(start):
 
 
 class Searching:
-    """A searcher that hands out motions and receives what became of them."""
+    """A searcher that hands out motions, None for a refusal, and receives what became of them."""
+
+    moving = False
 
     def __init__(self, *trajectories):
         self.left, self.outcomes, self.given = list(trajectories), [], []
@@ -491,14 +494,26 @@ class Searching:
     def finished(self):
         return not self.left
 
-    def next(self, depth, colour, joints, width):
-        self.given.append((depth.shape, colour.shape, joints, width))
+    def next(self, depth, colour, joints, width, **mask):
+        self.given.append((depth.shape, colour.shape, joints, width, mask))
+        if isinstance(self.left[0], Exception):
+            raise self.left.pop(0)
         kind = "none" if self.left[0] is None else self.left[0].action
-        return types.SimpleNamespace(kind=kind, reason="why", warnings=("odd",), trajectory=self.left[0])
+        self.moving = self.left[0] is not None
+        trajectory = self.left[0] if self.moving else self.left.pop(0)
+        return types.SimpleNamespace(kind=kind, reason="why", warnings=("odd",), trajectory=trajectory)
 
     def acted(self, ok):
         self.outcomes.append(ok)
         self.left.pop(0)
+        self.moving = False
+
+    def save(self, path):
+        Path(path).write_text(f"{len(self.left)} {self.moving}")
+
+    def load(self, path):
+        left, moving = Path(path).read_text().split()
+        self.left, self.moving = self.left[-int(left) :], moving == "True"
 
 
 def test_a_search_goes_on_until_the_target_is_out(start):
@@ -507,18 +522,61 @@ def test_a_search_goes_on_until_the_target_is_out(start):
     searcher = Searching(pushed(), taken())
     assert example.search(node, searcher)
     assert searcher.outcomes == [True, True]
-    assert searcher.given[0] == ((3, 4), (3, 4, 3), HERE, pytest.approx(0.03))
-    assert node.log[:2] == ["push: why", "odd"]
+    assert searcher.given[0] == ((3, 4), (3, 4, 3), HERE, pytest.approx(0.03), {})
+    assert node.log[:2] == ["push: why", "warning: odd"]
 
 
-def test_a_search_ends_where_nothing_can_be_done_or_somebody_says_no(start):
+def test_it_looks_again_before_it_asks_and_ends_where_somebody_says_no(start):
     example, node, stand_in = start()
     published(stand_in)
-    searcher = Searching(None)
+    refused = InputError("depth image: nothing was measured")
+    searcher, asked = Searching(refused, None, None, None, refused, taken()), []
+    assert example.search(node, searcher, ask=lambda reason: not asked.append(reason))
+    assert (asked, len(searcher.given), searcher.outcomes) == (["none: why"], 6, [True])
+    assert node.log[0] == "refused: depth image: nothing was measured"
+    stand_in.goals.clear()
+    searcher = Searching(*[None] * 9)
     assert not example.search(node, searcher)
-    assert len(searcher.given) == example.IDLE
+    assert len(searcher.given) == 3
     assert not example.search(node, Searching(taken()), confirm=lambda step: False)
     assert stand_in.goals == []
+
+
+def test_a_node_that_died_goes_on_and_its_last_motion_counts_as_failed(start, tmp_path):
+    example, node, stand_in = start(state=str(tmp_path / "search.npz"))
+    published(stand_in)
+    motions = (pushed(), pushed(), taken())
+    first, second = Searching(*motions), Searching(*motions)
+    # The power goes off in the second motion: nothing more is written.
+    follow = iter([lambda: True, lambda: first.__dict__.update(save=lambda path: None) or 1 / 0])
+    node.follow = lambda trajectory: next(follow)()
+    with pytest.raises(ZeroDivisionError):
+        example.search(node, first)
+    node.follow = lambda trajectory: True
+    assert example.search(node, second)
+    assert second.outcomes == [False, True]
+
+
+def test_masks_and_bursts_are_taken(start):
+    _, node, stand_in = start(mask="/mask", background=0, target_id=40, frames=2)
+    published(stand_in, seconds=6)
+    numbers = np.array([[0, 7, 7, 40], [0, 0, 7, 7], [0, 0, 0, 0]], np.uint8)
+    stand_in.publish("/mask", image(numbers, "mono8", 6))
+    with pytest.raises(TimeoutError, match="new depth images did not come"):
+        node.look(5.0)
+    assert node.lens.camera.width == 4
+
+    def arriving(arrived, what):
+        mm, seconds = (1600, 7) if what == "new depth images" else (1400, 6)
+        depth = image(np.full((3, 4), mm, np.uint16), "16UC1", seconds)
+        stand_in.publish("/camera/camera/aligned_depth_to_color/image_raw", depth)
+        assert arrived()
+
+    node._wait_for = arriving
+    look = node.look(5.0)
+    np.testing.assert_allclose(look["depth"], 1.4, rtol=1e-6)
+    assert look["mask"].tolist() == [[-1, 0, 0, 1], [-1, -1, 0, 0], [-1] * 4]
+    assert look["target_id"] == 1
 
 
 def test_what_failed_is_told_to_the_searcher_though_the_arm_stopped(start):

@@ -326,6 +326,9 @@ def test_where_nothing_is_tried_out_it_says_so(problem):
         searcher.problem, searcher.recogniser = problem, lambda *images: seen(OPEN)
     assert "no action is tried out before it is made" in plain.check().notices[0]
     assert bold.check().notices == ()
+    del bold.recogniser
+    (notice,) = bold.check().notices
+    assert "told by its colour, red 0.7282, green 0.1558 and blue 0.2099 (the default" in notice
     # A user's policy may try actions by itself.
     assert searcher_of(problem, OPEN).check().notices == ()
     done = Motion("retrieve", "it is found", object())

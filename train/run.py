@@ -164,5 +164,5 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
         # If there are many, only the card has them all.
         shown = scores if len(scores) <= SHOWN else {"all": scores["all"]}
         console.print(f"{group}: {shown}", soft_wrap=True)
-    console.print(str(out / f"{name}.npz"), soft_wrap=True)
+    console.print(str(out / f"{name}.npz"), soft_wrap=True, markup=False)
     return card

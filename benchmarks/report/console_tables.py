@@ -86,7 +86,7 @@ class EpisodeProgress:
     def compiling(self, text: str) -> None:
         """Say what is being compiled before a batch begins."""
         if not self._console.is_terminal:
-            self._console.print(text, soft_wrap=True)
+            self._console.print(text, soft_wrap=True, markup=False)
         self._bar.update(self._task, stage=text)
 
     def again(self, text: str) -> None:
@@ -110,5 +110,7 @@ class EpisodeProgress:
             outcome = "retrieved" if row.retrieved else row.failure
             count = f"{tally.ended}/{tally.wanted}"
             self._console.print(
-                f"{count} {row.scenario}: {outcome}, {row.steps} actions  ({rates}{errors})", soft_wrap=True
+                f"{count} {row.scenario}: {outcome}, {row.steps} actions  ({rates}{errors})",
+                soft_wrap=True,
+                markup=False,
             )

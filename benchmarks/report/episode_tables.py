@@ -31,9 +31,9 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
     if key.numbered:
         console.print()
         for label, short in key.short.items():
-            console.print(f"{short}  {label}", soft_wrap=True)
+            console.print(f"{short}  {label}", soft_wrap=True, markup=False)
     elif key.common:
-        console.print(f"all {key.common}", style="dim", soft_wrap=True)
+        console.print(f"all {key.common}", style="dim", soft_wrap=True, markup=False)
 
 
 def summary_table(summary: Sequence[Rates], key: Key) -> Table:

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mechsearch_jax.envs.health.reach import lost_poses
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.problem.settings import Settings
@@ -303,7 +304,7 @@ def target(settings: Settings) -> Iterator[Finding]:
         says = f"target: {2 * body.half_size[2]:.3f} m high, more than the shelf's free space"
         yield Finding("target", State.BROKEN, says, "mend [target] half_size, or [shelf] board and ceiling")
     else:
-        yield Finding("target", State.FINE, f"{body.shape}, {size} cm, fits gripper and shelf")
+        yield Finding("target", State.FINE, f"{body.shape}, {size} cm, fits gripper and shelf; {cell.told_by}")
 
 
 def shelf(settings: Settings) -> Iterator[Finding]:
@@ -322,6 +323,8 @@ def shelf(settings: Settings) -> Iterator[Finding]:
     says = f"the arm can grasp the target at {100 * share:.0f}% of its {len(problem.poses)} possible poses"
     few = share < LEAST_REACH
     yield Finding("shelf", State.DOUBTFUL if few else State.FINE, says, remedy if few else "")
+    for line in lost_poses(problem):
+        yield Finding("shelf", State.DOUBTFUL if few else State.FINE, line)
 
 
 def networks(settings: Settings) -> Iterator[Finding]:

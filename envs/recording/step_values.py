@@ -224,7 +224,12 @@ def mistaken(step: RecordedStep) -> bool:
 
 
 def trouble(recording: Recording, step: RecordedStep) -> str | None:
-    """Why the target could no longer be retrieved when the robot looked: it lay, or had left the board; else None."""
+    """Why the target could no longer be retrieved when the robot looked: it lay, or had left the board; else None.
+
+    None, too, where nobody knows where it is, as in a search on a robot that has not found it.
+    """
+    if not step.world.valid[TARGET]:
+        return None
     place, rotation = (np.asarray(a)[TARGET] for a in (step.world.position, step.world.rotation))
     return target_trouble(recording.shelf, place, rotation, recording.target.solid.ends_alike)
 

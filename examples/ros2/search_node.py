@@ -29,10 +29,13 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from mechsearch_jax.envs.cell.loading import load_searcher
-from mechsearch_jax.images.ros_images import colour_of, depth_of, lens_of
+from mechsearch_jax.images.image_files import numbered
+from mechsearch_jax.images.measured import median_depth
+from mechsearch_jax.images.ros_images import colour_of, depth_of, lens_of, mask_of
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.robot.arm_config import ARMS
 from mechsearch_jax.robot.ros_messages import gripper_command_goal, hand_goal, joint_trajectory_message, legs
+from mechsearch_jax.session.loop import run_search
 
 # How far the stamps of images that belong together may be apart [s], and how long the node waits for what it needs [s].
 SLOP, PATIENCE = 0.1, 30.0
@@ -40,8 +43,6 @@ SLOP, PATIENCE = 0.1, 30.0
 SPARE, CANCELLING = 30.0, 2.0
 # Age at which a joint state counts no more [s].
 STALE = 1.0
-# Steps without a motion, one after the other, after which the search ends.
-IDLE = 3
 
 PARAMETERS = {
     "config": "",
@@ -49,6 +50,10 @@ PARAMETERS = {
     "depth": "/camera/camera/aligned_depth_to_color/image_raw",
     "colour": "/camera/camera/color/image_raw",
     "camera_info": "/camera/camera/color/camera_info",
+    "mask": "",
+    "background": 255,
+    "target_id": -1,
+    "frames": 5,
     "rectified": False,
     "joint_states": "/joint_states",
     "arm_action": "",
@@ -56,6 +61,7 @@ PARAMETERS = {
     "gripper_namespace": "",
     "widest": 0.079,
     "confirm": True,
+    "state": "",
 }
 
 
@@ -106,7 +112,8 @@ class SearchNode(Node):
         self._latest, self._positions = {}, {}
         # Futures of the handles of goals whose result has not come.
         self._running = []
-        for name, kind in (("depth", Image), ("colour", Image), ("camera_info", CameraInfo)):
+        self._images = ["depth", "colour", *(["mask"] if self.given["mask"] else [])]
+        for name, kind in (*((name, Image) for name in self._images), ("camera_info", CameraInfo)):
             self.create_subscription(kind, self.given[name], self._keeper(name), qos_profile_sensor_data)
         self.create_subscription(JointState, self.given["joint_states"], self._keep_joints, qos_profile_sensor_data)
         arm = self.given["arm_action"] or f"/{robot}_arm_controller/follow_joint_trajectory"
@@ -171,14 +178,36 @@ class SearchNode(Node):
         return 1e-9 * self.get_clock().now().nanoseconds
 
     def look(self, since):
-        """A depth and a colour image that belong together and were taken after `since` [s], undistorted."""
+        """Images that belong together and were taken after `since` [s], undistorted, as `Searcher.next` takes them.
+
+        The depth is the median of several frames.
+        """
+        images = self._new(self._images, since)
+        frames = [images["depth"]]
+        while len(frames) < self.given["frames"]:
+            frames.append(self._new(["depth"], seconds_of(frames[-1].header.stamp))["depth"])
+        look = {
+            "depth": self.lens.depth(median_depth([depth_of(frame) for frame in frames])),
+            "colour": self.lens.colour(colour_of(images["colour"])),
+        }
+        if "mask" in images:
+            mask, numbers = numbered(mask_of(images["mask"]), self.given["background"], "mask")
+            look["mask"] = self.lens.mask(mask)
+            if self.given["target_id"] >= 0:
+                look["target_id"] = numbers.get(self.given["target_id"], -1)
+        return look
+
+    def _new(self, names, since):
+        """The messages of images that belong together and were taken after `since` [s]."""
+        found = {}
 
         def arrived():
-            stamps = [seconds_of(self._latest[n].header.stamp) for n in ("depth", "colour") if n in self._latest]
-            return len(stamps) == 2 and min(stamps) > since and max(stamps) - min(stamps) <= SLOP
+            found.update(self._latest)
+            stamps = [seconds_of(found[name].header.stamp) for name in names if name in found]
+            return len(stamps) == len(names) and min(stamps) > since and max(stamps) - min(stamps) <= SLOP
 
-        self._wait_for(arrived, "new depth and colour images")
-        return self.lens.depth(depth_of(self._latest["depth"])), self.lens.colour(colour_of(self._latest["colour"]))
+        self._wait_for(arrived, f"new {' and '.join(names)} images")
+        return found
 
     def follow(self, trajectory):
         """Execute a trajectory leg by leg; whether the hand did all that it was to do.
@@ -296,35 +325,35 @@ class SearchNode(Node):
             time.sleep(0.02)
 
 
-def search(node, searcher, confirm=lambda step: True):
+def search(node, searcher, confirm=lambda step: True, ask=lambda reason: False):
     """Search until the target is taken out; False if nothing more can be done, or the operator says no."""
-    log, since, idle = node.get_logger(), node.now(), 0
-    while not searcher.finished:
-        depth, colour = node.look(since)
-        step = searcher.next(depth, colour, joints=node.joints, width=node.width)
-        log.info(f"{step.kind}: {step.reason}")
-        for warning in step.warnings:
-            log.warning(warning)
-        if step.trajectory is None:
-            idle += 1
-            if idle == IDLE:
-                return False
-            continue
-        if not confirm(step):
-            return False
-        idle, ok = 0, False
-        try:
-            ok = node.follow(step.trajectory)
-        finally:
-            searcher.acted(ok)
-            since = node.now()
-    return True
+    return run_search(
+        searcher,
+        lambda: {**node.look(node.now()), "joints": node.joints, "width": node.width},
+        node.follow,
+        ask,
+        confirm=confirm,
+        tell=node.get_logger().info,
+        state=node.given["state"] or None,
+    )
 
 
 def confirmed(step):
     """Whether the operator agrees to a motion."""
     print(f"{step.kind}: {step.reason}\n{step.trajectory.report()}")
     return input("Move? [y/N] ").strip().lower() == "y"
+
+
+def asked(searcher):
+    """A function that asks whether to look again; the operator may also say that the hand has the target."""
+
+    def ask(reason):
+        answer = input("Look again? [y/N, t: the target is in the hand] ").strip().lower()
+        if answer == "t":
+            searcher.acted()
+        return answer in ("y", "t")
+
+    return ask
 
 
 def main():
@@ -340,10 +369,14 @@ def main():
         if node.lens.distorts:
             node.get_logger().info("images are undistorted by d of camera_info; if they are rectified: rectified:=true")
         searcher = load_searcher(path, camera=node.lens.camera, arm=node.model)
-        for warning in searcher.check().warnings:
-            node.get_logger().warning(warning)
-        searcher.warm_up(lambda what, left: node.get_logger().info(f"preparing {what}"), colour=True)
-        retrieved = search(node, searcher, confirmed if node.given["confirm"] else lambda step: True)
+        check = searcher.check()
+        for line in (*check.warnings, *check.notices):
+            node.get_logger().warning(line)
+        mask = bool(node.given["mask"])
+        kinds = {"colour": True, "mask": mask, "target_id": mask and node.given["target_id"] >= 0}
+        searcher.warm_up(lambda what, left: node.get_logger().info(f"preparing {what}"), **kinds)
+        asking = (confirmed, asked(searcher)) if node.given["confirm"] else ()
+        retrieved = search(node, searcher, *asking)
         node.get_logger().info("the target is out" if retrieved else "the search ended without the target")
     finally:
         node.cancel()

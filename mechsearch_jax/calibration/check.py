@@ -30,7 +30,7 @@ CAUSES = (
     "turned, and the unit and scale of the depth (metres along the camera's axis)"
 )
 MEASURES = "measure the shelf again, and check the scale of the depth and the focal lengths"
-REMEDY = "mechsearch calibrate --depth IMAGE --config FILE.toml (or --camera FILE.json) measures and corrects it"
+REMEDY = "mechsearch calibrate --depth IMAGE --config FILE.toml measures and corrects it"
 
 
 def placement_faults(

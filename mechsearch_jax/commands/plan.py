@@ -186,7 +186,7 @@ def plan(
         searcher = searcher_of(settings, camera=camera, seed=seed)
         check = searcher.check()
         if _finished(searcher, state, failed):
-            console.print(f"{state}: the target was taken out; the search is finished", soft_wrap=True)
+            console.print(f"{state}: the target was taken out; the search is finished", soft_wrap=True, markup=False)
             return
         status.update("looking and planning; the first time in a workcell this takes minutes")
         step = searcher.next(**arguments, joints=joints or None, width=width)
@@ -211,12 +211,14 @@ def _finished(searcher: Searcher, state: Path | None, failed: bool) -> bool:
 
 def _report(console: Console, step: SearchStep, check: Check, files: list[Path]) -> None:
     """Print the action, its reason, and the files."""
+    from rich.markup import escape
+
     for notice in check.notices:
-        console.print(f"note: {notice}", soft_wrap=True)
+        console.print(f"note: {escape(notice)}", soft_wrap=True)
     for warning in dict.fromkeys((*check.warnings, *step.warnings)):
-        console.print(f"[yellow]warning[/yellow]: {warning}", soft_wrap=True)
-    console.print(f"[bold]{step.kind}[/bold]: {step.reason}", soft_wrap=True)
-    console.print("\n".join(str(file) for file in files), soft_wrap=True)
+        console.print(f"[yellow]warning[/yellow]: {escape(warning)}", soft_wrap=True)
+    console.print(f"[bold]{step.kind}[/bold]: {escape(step.reason)}", soft_wrap=True)
+    console.print("\n".join(str(file) for file in files), soft_wrap=True, markup=False)
 
 
 def _example(out: Path) -> tuple[dict[str, Any], Camera]:

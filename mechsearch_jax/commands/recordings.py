@@ -178,7 +178,7 @@ def make_film(
 
     film = Film(recording, width, fps, speed)
     save_movie(track(film, "filming", total=film.count, console=console, transient=True), path, fps)
-    console.print(str(path), soft_wrap=True)
+    console.print(str(path), soft_wrap=True, markup=False)
 
 
 def make_page(recording: Recording, path: Path, console: Console, film: Path | None = None) -> None:
@@ -191,4 +191,4 @@ def make_page(recording: Recording, path: Path, console: Console, film: Path | N
 
     with console.status("drawing"):
         save_page(recording, path, film)
-    console.print(str(path), soft_wrap=True)
+    console.print(str(path), soft_wrap=True, markup=False)

@@ -83,7 +83,7 @@ def report(
     if remark := changed_scenarios_remark(episodes):
         print(f"report: {remark}", file=sys.stderr)
     if out is not None:
-        console.print(f"{out / 'report.html'}\n{out / 'report.md'}", soft_wrap=True)
+        console.print(f"{out / 'report.html'}\n{out / 'report.md'}", soft_wrap=True, markup=False)
 
 
 def _print(console: Console, report: Report, columns_chosen: bool) -> None:

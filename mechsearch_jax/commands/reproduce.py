@@ -213,4 +213,4 @@ def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[J
     results = results_of(table, jobs, folder.rows)
     page, _ = write_table(results, out, shlex.join(["mechsearch", *sys.argv[1:]]))
     console.print(screen(results))
-    console.print(str(page), soft_wrap=True)
+    console.print(str(page), soft_wrap=True, markup=False)

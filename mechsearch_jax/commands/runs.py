@@ -340,4 +340,4 @@ def run_jobs(
             f"{command}: {errors} of {len(rows)} episodes ended in an error; --retry-errors runs them again",
             file=sys.stderr,
         )
-    console.print(str(out), soft_wrap=True)
+    console.print(str(out), soft_wrap=True, markup=False)

@@ -187,6 +187,7 @@ def search(
       options: how the planner decides.
     """
     from rich.console import Console
+    from rich.markup import escape
 
     from mechsearch_jax.envs.episode.episodes import target_of
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
@@ -211,7 +212,8 @@ def search(
             preparing.add(motions(SimulatorConfig().motion))
             scene = make_scene()
             console.print(
-                f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
+                f"[bold]{escape(scene.name)}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; "
+                f"{escape(chosen.name)}"
             )
             problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.config.problem)
             episode, narrator, recorder = _run(status, preparing, chosen, scene, problem, seed, keeps.records)
@@ -225,7 +227,7 @@ def search(
         if keeps.records:
             save_recording(recording, out / NAME)
     narrator.ended(episode)
-    console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True)
+    console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True, markup=False)
     keeps.make(recording, console)
 
 

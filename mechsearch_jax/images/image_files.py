@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from PIL import Image
 
 from mechsearch_jax.images.labels import INSTANCES, OTHER
@@ -86,24 +86,34 @@ def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], 
     Raises:
       InputError: the file cannot be read, is not a mask, or has too many objects.
     """
-    image = load_pixels(path)
+    return numbered(load_pixels(path), background, str(path))
+
+
+def numbered(
+    image: Shaped[np.ndarray, "..."], background: int, where: str
+) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
+    """A mask for a `Recogniser` of one with any numbers; as `load_mask`, whose messages begin with `where`.
+
+    Raises:
+      InputError: as `load_mask`.
+    """
     if image.ndim != 2 or image.dtype.kind not in "iu":
-        raise InputError(f"{path}: holds {image.dtype} of shape {image.shape}; a mask has one whole number a pixel")
+        raise InputError(f"{where}: holds {image.dtype} of shape {image.shape}; a mask has one whole number a pixel")
     numbers, count = np.unique(image, return_counts=True)
     named = [(int(n), int(c)) for n, c in zip(numbers, count, strict=True) if n != background and n >= 0]
     for number, pixels in named:
         if pixels > LARGEST * image.size:
             raise InputError(
-                f"{path}: number {number} covers {100 * pixels / image.size:.0f}% of the image; if it stands for no "
+                f"{where}: number {number} covers {100 * pixels / image.size:.0f}% of the image; if it stands for no "
                 f"object, say so: --background {number}"
             )
     if len(named) > INSTANCES:
-        raise InputError(f"{path}: names {len(named)} objects; at most {INSTANCES} can be told apart")
-    numbered = {number: i for i, (number, _) in enumerate(named)}
+        raise InputError(f"{where}: names {len(named)} objects; at most {INSTANCES} can be told apart")
+    new = {number: i for i, (number, _) in enumerate(named)}
     mask = np.full(image.shape, OTHER, np.int32)
-    for number, i in numbered.items():
+    for number, i in new.items():
         mask[image == number] = i
-    return mask, numbered
+    return mask, new
 
 
 def load_camera(path: PathLike) -> Camera:

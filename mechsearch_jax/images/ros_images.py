@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from mechsearch_jax.images.lens import Lens, distortion_of
 from mechsearch_jax.runtime.errors import InputError
@@ -15,6 +15,11 @@ from mechsearch_jax.workspace.camera import Camera
 
 # The type of a channel and the number of channels of each encoding.
 DEPTH = {"16UC1": (np.uint16, 1), "mono16": (np.uint16, 1), "32FC1": (np.float32, 1)}
+MASK = {
+    **dict.fromkeys(("8UC1", "mono8"), (np.uint8, 1)),
+    **dict.fromkeys(("16UC1", "mono16"), (np.uint16, 1)),
+    "32SC1": (np.int32, 1),
+}
 COLOUR = {name: (np.uint8, len(name) - 1) for name in ("rgb8", "bgr8", "rgba8", "bgra8")}
 
 
@@ -39,6 +44,15 @@ def colour_of(image: Any) -> UInt8[np.ndarray, "h w 3"]:
     """
     array = _pixels(image, COLOUR)[..., :3]
     return array[..., ::-1].copy() if image.encoding.startswith("bgr") else array
+
+
+def mask_of(image: Any) -> Int[np.ndarray, "h w"]:
+    """The numbers of a `sensor_msgs/Image` that names objects; `image_files.numbered` makes a mask of them.
+
+    Raises:
+      InputError: as `depth_of`.
+    """
+    return _pixels(image, MASK)[..., 0].astype(np.int32)
 
 
 def lens_of(info: Any, camera: Camera, rectified: bool = False) -> Lens:

@@ -83,6 +83,16 @@ class Workcell:
         """A `detector` of a `Recogniser`, which finds the target's pixels by their colour."""
         return TargetColour.lit(self.colour, self.hue_tolerance)
 
+    @property
+    def told_by(self) -> str:
+        """What tells the target from other things, in words."""
+        usual = " (the default; [target] colour sets it)" if self.colour == RED else ""
+        red, green, blue = self.colour
+        return (
+            f"without target_id it is told by its colour, red {red:g}, green {green:g} and blue {blue:g}{usual}, "
+            "also where a mask is given"
+        )
+
     def is_cached(self, target: Target, config: ProblemConfig) -> bool:
         """Whether the problem of a target was built before and is on disk."""
         return is_cached(target, config, **self._around)

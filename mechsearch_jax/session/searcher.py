@@ -30,6 +30,7 @@ from mechsearch_jax.belief.impasse import hindrance, impasse
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.images.colour import RED
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.plausibility import EMPTY_SHELF, sight_faults
 from mechsearch_jax.perception.recogniser import Recogniser
@@ -186,7 +187,10 @@ class Searcher:
             warnings.insert(0, NOWHERE)
         elif reach < LEAST_REACH:
             warnings.append(f"shelf: the arm can grasp the target at {100 * reach:.0f}% of its possible poses only")
-        return Check(reach, tuple(warnings), (UNTRIED,) if tries_nothing(self._policy, self._trials) else ())
+        notices = [UNTRIED] if tries_nothing(self._policy, self._trials) else []
+        if isinstance(self.recogniser, Recogniser) and self.workcell.colour == RED:
+            notices.append(f"target: {self.workcell.told_by}")
+        return Check(reach, tuple(warnings), tuple(notices))
 
     @in_own_settings
     def warm_up(

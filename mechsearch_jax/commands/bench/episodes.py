@@ -61,7 +61,7 @@ def bench_guard(
         rows = evaluate(jobs, out, Processes(workers or cores()), progress.ended, progress.waiting)
     if before is None:
         guard.save_reference(rows, _command(), stored)
-        console.print(str(stored), soft_wrap=True)
+        console.print(str(stored), soft_wrap=True, markup=False)
         return
     comparisons = guard.compare(before.outcomes, [guard.Outcome.of_row(row) for row in rows])
     console.print(guard_table(comparisons, before.code))

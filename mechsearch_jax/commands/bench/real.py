@@ -52,7 +52,7 @@ def bench_real(folder: Folder, /, *, shelf: ConfigFile = None, out: Out = None) 
         console.print(f"{unlabelled} images have no labels and are left out")
     if out is not None:
         looks.save_results(made, of_looks, out / "results.json")
-        console.print(str(out), soft_wrap=True)
+        console.print(str(out), soft_wrap=True, markup=False)
 
 
 COMMANDS = {"real": bench_real}

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Largest turn of a shelf that stays as it is when the shelf's place is corrected, for its faces are axis-aligned [rad].
 SHELF_TURN = 0.005
+# What the table of a shelf says of its place.
+PLACES = ("front", "back", "right", "left", "board", "ceiling")
 
 
 def calibrate(
@@ -30,13 +32,14 @@ def calibrate(
     """Measure on the shelf in a depth image how far the camera's pose is off, and write the corrected one.
 
     The planes of the board, the walls and the upper board are fitted, as far as they are in sight; objects may stand
-    before them. One image says where camera and shelf are to each other: which of them is off is for you to say.
+    before them. One image says where camera and shelf are to each other: which of them is off is for you to say. The
+    configuration has to say where the shelf is.
 
     Args:
       depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
       camera: JSON with the fields of a ROS CameraInfo and T_world_camera, whose lens may distort; the configuration's
         camera if not given.
-      config: file of settings, of which the shelf is taken, and the camera.
+      config: file of settings, of which the shelf is taken, and the camera; its table [shelf] must say where that is.
       moved: what is off and is corrected: the camera's pose, or the place of the shelf.
       out: file for the correction: the configuration with the corrected pose (.toml), or the camera (.json).
     """
@@ -53,6 +56,7 @@ def calibrate(
     if out is not None and out.suffix.lower() not in suffixes:
         raise InputError(f"calibrate: --out {out} must end in {' or '.join(suffixes)}")
     workcell = settings_of(config).workcell
+    _check_shelf(config)
     lens, shelf = Lens(workcell.camera) if camera is None else load_lens(camera), workcell.shelf
     if lens.distorts and out is not None and out.suffix.lower() == ".toml" and moved == "camera":
         raise InputError(
@@ -65,6 +69,8 @@ def calibrate(
     check_images(given, image)
     fit = fit_shelf(given, shelf, image)
     check_in_sight(fit, shelf, image)
+    places = ", ".join(f"{name} {getattr(shelf, name):g}" for name in PLACES)
+    print(f"{config}: the shelf in the robot's frame: {places} m; the camera of {camera or config}")
     print(report(fit, moved))
     check_holds(fit, shelf, image)
     if moved == "shelf":
@@ -76,6 +82,23 @@ def calibrate(
         _write_shelf(shelf.moved(tuple((-fit.shift).tolist())), config, out)
     else:
         _write_camera(Lens(fit.corrected, lens.distortion), config, out, whole=camera is not None)
+
+
+def _check_shelf(config: Path | None) -> None:
+    """Check that it is said which shelf the image shows: the default one is nobody's.
+
+    Raises:
+      InputError: it is not.
+    """
+    from mechsearch_jax.runtime.tables import read_document
+
+    missing = [n for n in PLACES if config is None or n not in read_document(config).tables.get("shelf", {})]
+    if missing:
+        where = "there is no --config" if config is None else f"{config}: [shelf] has no {', '.join(missing)}"
+        raise InputError(
+            f"calibrate: {where}; write the shelf's front, back, right, left, board and ceiling into [shelf] of a file "
+            "(mechsearch config prints one), and give it with --config"
+        )
 
 
 def _write_camera(lens: Lens, config: Path | None, out: Path | None, whole: bool) -> None:
@@ -102,8 +125,7 @@ def _write_shelf(shelf: Shelf, config: Path | None, out: Path | None) -> None:
         return
     x, y, z = base_of(config)
     moved = shelf.moved((x, y, z))
-    names = ("front", "back", "right", "left", "board", "ceiling", "spawn_x", "spawn_y")
-    values = {name: getattr(moved, name) for name in names}
+    values = {name: getattr(moved, name) for name in (*PLACES, "spawn_x", "spawn_y")}
     rounded = {k: round(v, 5) if isinstance(v, float) else [round(a, 5) for a in v] for k, v in values.items()}
     _write_values(config, out, "shelf", rounded)
 
