@@ -168,8 +168,9 @@ def _settings(config: Config | Workcell | Mismatch, prefix: str) -> Iterator[tup
                 yield f"{path}{name}", part
 
     settings = inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
-    # The arm of a workcell's gripper follows from its model.
-    return ((path, value) for path, value in settings if not path.startswith("workcell.gripper.arm."))
+    # The arm of a workcell's gripper follows from its model, and simulated episodes have no obstacles.
+    unused = ("workcell.gripper.arm.", "workcell.obstacles", "workcell.camera_body")
+    return ((path, value) for path, value in settings if not path.startswith(unused))
 
 
 def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:

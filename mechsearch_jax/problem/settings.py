@@ -19,6 +19,7 @@ from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
+from mechsearch_jax.workspace.obstacle import CAMERA_BODY, Obstacle
 from mechsearch_jax.workspace.scenario import parse_compound
 from mechsearch_jax.workspace.target import DENSITY, FRICTION, Target
 
@@ -84,11 +85,15 @@ _PARTS: Mapping[str, Any] = {
     **{
         field.name: getattr(Workcell(), field.name)
         for field in dataclasses.fields(Workcell)
-        if field.name not in ("colour", "hue_tolerance")
+        if field.name not in ("colour", "hue_tolerance", "camera_body", "obstacles")
     },
     "base": Base(),
     "objects": ObjectSizes(),
 }
+
+
+# The key of the camera's table that is the workcell's `camera_body`, and the tables of which there may be several.
+BODY, OBSTACLE = "body", "obstacle"
 
 
 # What a target of several pieces is made of, instead of a shape and half-extents, and the defaults.
@@ -103,6 +108,7 @@ def tables() -> dict[str, dict[str, Any]]:
     }
     parts["target"].pop("compound")
     parts["gripper"].pop("arm")
+    parts["camera"][BODY] = Workcell().camera_body
     parts["target"] |= _MADE_OF | {COLOUR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
@@ -117,17 +123,22 @@ def load_settings(path: PathLike) -> Settings:
       InputError: the file cannot be read or is not TOML; a table or key is unknown; a value is of the wrong type or
         impossible. The message names file, line, table and key.
     """
-    document = read_document(path)
-    names = [*_PARTS, PLANNER]
+    document = read_document(path, arrays=(OBSTACLE,))
+    names, bodies = [*_PARTS, PLANNER, OBSTACLE], [name for name in document.tables if name.startswith(f"{OBSTACLE} ")]
     for table in document.tables:
-        if table and table not in names:
+        if table == OBSTACLE:
+            raise InputError(
+                f"{document.where(table)} must have two brackets, [[{OBSTACLE}]], since there may be several"
+            )
+        if table and table not in [*names, *bodies]:
             raise InputError(f"{document.where(table)} is unknown; {nearest(table, names)}")
     if "arm" in document.tables.get("gripper", {}):
         raise InputError(f"{document.where('gripper', 'arm')} is unknown; say which arm it is by model in [arm]")
     for key in document.tables[""]:
-        begin = ", ".join(f"[{table}]" for table in names)
+        begin = ", ".join(f"[[{table}]]" if table == OBSTACLE else f"[{table}]" for table in names)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
     detector, document = _detector(document)
+    body, document = _camera_body(document)
     base = with_table(document, "base", Base())
     x, y, z = base.position
     document = _with_moved_place(document, (-x, -y, -z))
@@ -146,6 +157,10 @@ def load_settings(path: PathLike) -> Settings:
         {"inset": target.inset},
         lambda given: Workcell(target=target if given else Target(), **detector, **parts),
     )
+    bodied = lambda given: dataclasses.replace(workcell, camera_body=given.get(BODY, CAMERA_BODY))  # noqa: E731
+    workcell = apply(document, "camera", body, bodied)
+    for name in bodies:
+        workcell = _with_obstacle(document, name, workcell, (-x, -y, -z))
     return _with_planner(document, Settings(workcell, objects))
 
 
@@ -181,6 +196,52 @@ def _detector(document: Document) -> tuple[dict[str, Any], Document]:
     rest = {key: value for key, value in table.items() if key not in names}
     without = dataclasses.replace(document, tables={**document.tables, "target": rest})
     return {names[key]: value for key, value in given.items()}, without
+
+
+def _camera_body(document: Document) -> tuple[dict[str, Any], Document]:
+    """The size of the camera's body, if it is given, and the document without it."""
+    table = dict(document.tables.get("camera", {}))
+    if BODY not in table:
+        return {}, document
+    size = checked(table.pop(BODY), tuple[float, float, float], document.where("camera", BODY))
+    return {BODY: size}, dataclasses.replace(document, tables={**document.tables, "camera": table})
+
+
+def _with_obstacle(document: Document, table: str, workcell: Workcell, shift: tuple[float, float, float]) -> Workcell:
+    """The workcell with the obstacle of a table, moved into the base's frame."""
+    obstacles = (*workcell.obstacles, _obstacle(document, table).moved(shift))
+    return apply(document, table, {}, lambda _: dataclasses.replace(workcell, obstacles=obstacles))
+
+
+def _obstacle(document: Document, table: str) -> Obstacle:
+    """The obstacle of a table."""
+    given = document.tables[table]
+    row = tuple[float, float, float]
+    hints: dict[str, Any] = {
+        "name": str,
+        "shape": Literal["box", "cylinder"],
+        "size": row,
+        "mesh": str,
+        "scale": float,
+        "position": row,
+        "rotation": tuple[row, row, row],
+    }
+    check_names(document, table, hints)
+    needed, foreign, what = (("name", "size", "position"), ("scale",), "box or cylinder")
+    if "mesh" in given:
+        needed, foreign, what = ("name", "mesh"), ("shape", "size"), "mesh"
+    for key in foreign:
+        if key in given:
+            raise InputError(f"{document.where(table, key)}: is nothing that a {what} has; leave it out")
+    for key in needed:
+        if key not in given:
+            raise InputError(f"{document.where(table)}: {key} is missing")
+    values = {key: checked(value, hints[key], document.where(table, key)) for key, value in given.items()}
+    if "mesh" in values:
+        needed = {"name": values["name"], "mesh": Path(document.path).parent / values.pop("mesh")}
+        return apply(document, table, values, lambda changes: Obstacle.of_mesh(**{**changes, **needed}))
+    usual = Obstacle("obstacle", (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
+    return apply(document, table, values, lambda changes: dataclasses.replace(usual, **changes))
 
 
 def _rgb(document: Document, value: Any) -> tuple[float, float, float]:

@@ -16,6 +16,7 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.obstacle import CAMERA, CAMERA_BODY, Obstacle, camera_body
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -31,6 +32,10 @@ class Workcell:
       colour: of the target in colour images: red, green and blue in 0 to 1. The planner's programs do not depend on it.
       hand: how the real hand is used.
       hue_tolerance: by how much hues may differ from the target's and count as equal [degrees].
+      camera_body: size of the camera's body along its x, y and z, around its pose [m]; zeros for none. Outside the
+        shelf it is an obstacle, but not at the default pose, where the camera is simulated.
+      obstacles: what else the arm keeps clear of. Decisions depend on it, and on the camera's body, only where the arm
+        cannot execute one.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -45,6 +50,8 @@ class Workcell:
     hand: HandConfig = dataclasses.field(default_factory=HandConfig, repr=False)
     # Not in the representation, so that searches that were saved before it existed go on.
     hue_tolerance: float = dataclasses.field(default=HUE, repr=False)
+    camera_body: tuple[float, float, float] = dataclasses.field(default=CAMERA_BODY, repr=False)
+    obstacles: tuple[Obstacle, ...] = dataclasses.field(default=(), repr=False)
 
     def __post_init__(self):
         TargetColour.lit(self.colour, self.hue_tolerance)
@@ -60,6 +67,14 @@ class Workcell:
             raise InputError(
                 f"Target: inset ({self.target.inset}) leaves no place on a board of {room:g} m; it must be below half"
             )
+        if any(self.camera_body):
+            # Its size has to be one wherever the camera is.
+            Obstacle(CAMERA, self.camera_body, (0.0, 0.0, 0.0))
+        names = [CAMERA, *(obstacle.name for obstacle in self.obstacles)]
+        for name in names:
+            if names.count(name) > 1:
+                why = "the camera's body is called so" if name == CAMERA else "there are several"
+                raise InputError(f"Obstacle: name {name!r} is taken ({why}); give each another one")
 
     def problem(self, target: Target | None = None, config: ProblemConfig | None = None) -> Problem:
         """The problem of a target, by default this workcell's; read from disk if it was built before.
@@ -77,6 +92,11 @@ class Workcell:
         """
         gripper = dataclasses.replace(self.gripper, arm=PANDA)
         return dataclasses.replace(self, arm=dataclasses.replace(self.arm, model=model), gripper=gripper)
+
+    @property
+    def bodies(self) -> tuple[Obstacle, ...]:
+        """All obstacles, the camera's body first if it is outside the shelf."""
+        return (*camera_body(self.camera, self.shelf, self.camera_body), *self.obstacles)
 
     @property
     def detector(self) -> TargetColour:

@@ -1,9 +1,9 @@
 """Distance of the whole arm from the shelf, objects and itself at any joint angles, for free motions.
 
 Every primitive of links 1 to 7, the hand, the fingers and the held object is covered by spheres, which reach at most
-`CELL` / 2 beyond it; objects are represented by their bounding boxes. So distances are never too large, and up to about
-1 cm too small. The planner's tests only cover straight approaches with a fixed wrist inside the shelf; here any joint
-may turn. NumPy suffices: a few milliseconds for a path.
+`CELL` / 2 beyond it; objects are represented by their bounding boxes, other obstacles as they are. So distances are
+never too large, and up to about 1 cm too small. The planner's tests only cover straight approaches with a fixed wrist
+inside the shelf; here any joint may turn. NumPy suffices: a few milliseconds for a path.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import RobotPart, fingers, hand_parts, link_parts
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.obstacle import Obstacle
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Edge of the cells into which boxes are divided, with a sphere around each [m]. Coarse cells are for self-collisions,
@@ -34,6 +35,9 @@ FOOT = ((0.0, 0.0, 0.06), (0.0, 0.0, 0.333), 0.08)
 HAND_FRAME = 7
 # In an image, what is this near to the arm may be the arm: the primitives' error and the camera's [m].
 AROUND = 0.02
+# What there is beside objects and obstacles.
+ALWAYS = ITSELF, FLOOR, SHELF = ("itself", "the floor", "the shelf")
+TARGET = "the target"
 
 
 class Spheres(NamedTuple):
@@ -43,11 +47,13 @@ class Spheres(NamedTuple):
       frame: of each, ascending, shape (n,).
       centre: in that frame [m], shape (n, 3).
       radius: [m], shape (n,).
+      edges: of the box's cell inside it, as columns in that frame [m]; zeros if it covers a capsule. Shape (n, 3, 3).
     """
 
     frame: Int[np.ndarray, " n"]
     centre: Float[np.ndarray, "n 3"]
     radius: Float[np.ndarray, " n"]
+    edges: Float[np.ndarray, "n 3 3"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,29 +100,57 @@ class Obstacles:
 
     Attributes:
       shelf: with the planner's margins; everything beyond its front plane and outside its free space is solid.
-      half_size: of the objects' bounding boxes [m], shape (n, 3).
+      half_size: of the objects' bounding boxes, and of obstacles [m], shape (n, 3).
       T_box_world: inverse poses of the boxes, shape (n, 4, 4).
       floor: height of the floor [m].
+      names: how messages call what there is: the arm itself, the floor, the shelf, and each of the n.
+      round: which of the n are no boxes but cylinders about z.
     """
 
     shelf: Shelf
     half_size: Float[np.ndarray, "n 3"]
     T_box_world: Float[np.ndarray, "n 4 4"]
     floor: float
+    names: tuple[str, ...]
+    round: tuple[bool, ...]
 
     @classmethod
-    def of(cls, shelf: Shelf, scenes: tuple[Superquadrics, ...] = (), floor: float = 0.0) -> Obstacles:
-        """The shelf and the valid objects of scenes with fields (N, ...)."""
+    def of(
+        cls,
+        shelf: Shelf,
+        scenes: tuple[Superquadrics, ...] = (),
+        floor: float = 0.0,
+        *,
+        target: tuple[Superquadrics, ...] = (),
+        bodies: tuple[Obstacle, ...] = (),
+    ) -> Obstacles:
+        """The shelf, the valid objects of scenes with fields (N, ...), those that the target is made of, and others."""
         sizes: list[np.ndarray] = [np.zeros((0, 3))]
         poses: list[np.ndarray] = [np.zeros((0, 4, 4))]
-        for scene in scenes:
+        names = [*ALWAYS]
+        for scene in (*scenes, *target):
             valid = np.asarray(scene.valid)
             pose = np.tile(np.eye(4), (int(valid.sum()), 1, 1))
             pose[:, :3, :3] = np.asarray(scene.rotation, float)[valid]
             pose[:, :3, 3] = np.asarray(scene.position, float)[valid]
             sizes.append(np.asarray(scene.size, float)[valid])
             poses.append(np.linalg.inv(pose))
-        return cls(shelf, np.concatenate(sizes).astype(np.float32), np.concatenate(poses).astype(np.float32), floor)
+            is_target = any(scene is other for other in target)
+            names += [TARGET if is_target else f"object {i}" for i in np.flatnonzero(valid)]
+        for body in bodies:
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = body.rotation, body.position
+            sizes.append(np.array(body.size, float)[None] / 2)
+            poses.append(np.linalg.inv(pose)[None])
+            names.append(f'obstacle "{body.name}"')
+        half_size, inverse = (np.concatenate(rows).astype(np.float32) for rows in (sizes, poses))
+        round_ones = [False] * (len(half_size) - len(bodies)) + [body.shape == "cylinder" for body in bodies]
+        return cls(shelf, half_size, inverse, floor, tuple(names), tuple(round_ones))
+
+    @property
+    def bare(self) -> Obstacles:
+        """Without objects, target and other bodies."""
+        return Obstacles.of(self.shelf, floor=self.floor)
 
 
 class Clearance(NamedTuple):
@@ -126,16 +160,24 @@ class Clearance(NamedTuple):
       free: distance to the nearest obstacle, or of the hand from the arm's foot and upper arm, at most `FARTHEST`;
         0 or less where the arm may touch [m], shape (m,).
       inside: how far the arm reaches beyond the plane of the shelf's front; negative in front of it [m], shape (m,).
+      each: distance to each of `Obstacles.names`; `free` is the least of them [m], shape (m, n).
     """
 
     free: Float[np.ndarray, " m"]
     inside: Float[np.ndarray, " m"]
+    each: Float[np.ndarray, "m n"]
 
 
 def clearance(body: ArmBody, obstacles: Obstacles, q: Float[np.ndarray, "m 7"]) -> Clearance:
     """The clearance of the arm at joint angles `q` [rad]."""
     parts = [_block_clearance(body, obstacles, q[i : i + BLOCK]) for i in range(0, len(q), BLOCK)]
-    return Clearance(np.concatenate([p.free for p in parts]), np.concatenate([p.inside for p in parts]))
+    return Clearance(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def touched(obstacles: Obstacles, each: Float[np.ndarray, "m n"]) -> str:
+    """What the arm reaches into the deepest, and how deep, from `Clearance.each`, in words."""
+    nearest = int(np.argmin(each.min(axis=0)))
+    return f"{obstacles.names[nearest]} ({-1000 * float(each[:, nearest].min()):.0f} mm deep)"
 
 
 def link_poses(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 8 4 4"]:
@@ -159,12 +201,15 @@ def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clea
     centres, radius = placed(body.fine, frames), body.fine.radius
     # The foot and links 1 and 2 stand on the floor.
     to_floor = (centres[..., 2] - radius - obstacles.floor)[:, body.fine.frame >= 2]
-    free = np.minimum(to_floor.min(axis=1), FARTHEST)
-    free = np.minimum(free, _shelf_clearance(obstacles.shelf, centres, radius))
-    free = np.minimum(free, _objects_clearance(obstacles, centres, radius))
-    free = np.minimum(free, _self_distance(body.coarse, frames))
+    around = (
+        _self_distance(body.coarse, frames),
+        to_floor.min(axis=1),
+        _shelf_clearance(obstacles.shelf, centres, radius),
+    )
+    each = np.stack([*around, *_objects_clearance(obstacles, centres, radius)], axis=1).astype(float)
+    each = np.minimum(each, FARTHEST)
     inside = np.max(centres[..., 0] + radius, axis=1) - obstacles.shelf.front
-    return Clearance(free.astype(float), inside.astype(float))
+    return Clearance(each.min(axis=1), inside.astype(float), each)
 
 
 def placed(spheres: Spheres, frames: np.ndarray) -> np.ndarray:
@@ -180,11 +225,11 @@ def _shelf_clearance(shelf: Shelf, centres: np.ndarray, radius: np.ndarray) -> n
     """Distance of the spheres to the shelf's solid parts, at most `FARTHEST`, shape (m,)."""
     least = np.full(len(centres), FARTHEST)
     row, column = np.nonzero(centres[..., 0] + radius > shelf.front - FARTHEST)
-    np.minimum.at(least, row, _shelf_distance(shelf, centres[row, column]) - radius[column])
+    np.minimum.at(least, row, shelf_distance(shelf, centres[row, column]) - radius[column])
     return least
 
 
-def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
+def shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     """Distance to the shelf's solid parts, negative inside; beside its free space, to the front plane."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     walls = shelf.walls
@@ -195,17 +240,30 @@ def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     return np.where(before > 0.0, in_front, np.minimum(beside, walls.back - x))
 
 
-def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Distance to the nearest box, at most `FARTHEST`, shape (m,)."""
-    least = np.full(len(centres), FARTHEST)
-    for half_size, T in zip(obstacles.half_size, obstacles.T_box_world, strict=True):
+def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:
+    """Distance to each box or cylinder, at most `FARTHEST`, shapes (m,)."""
+    distances = []
+    for i, (half_size, T) in enumerate(zip(obstacles.half_size, obstacles.T_box_world, strict=True)):
+        least = np.full(len(centres), FARTHEST)
         middle, reach = -T[:3, :3].T @ T[:3, 3], float(np.linalg.norm(half_size)) + FARTHEST
-        row, column = np.nonzero(np.sum((centres - middle) ** 2, axis=-1) < (reach + radius) ** 2)
+        apart = centres - middle
+        row, column = np.nonzero(np.einsum("mni,mni->mn", apart, apart) < (reach + radius) ** 2)
         if len(row):
-            past = np.abs(centres[row, column] @ T[:3, :3].T + T[:3, 3]) - half_size
-            outside = np.linalg.norm(np.maximum(past, 0.0), axis=-1) + np.minimum(past.max(axis=-1), 0.0)
-            np.minimum.at(least, row, outside - radius[column])
-    return least
+            np.minimum.at(least, row, body_distance(obstacles, i, centres[row, column]) - radius[column])
+        distances.append(least)
+    return distances
+
+
+def body_distance(obstacles: Obstacles, i: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Distance of points to a box or cylinder, negative inside [m]."""
+    half_size, T = obstacles.half_size[i], obstacles.T_box_world[i]
+    local = points @ T[:3, :3].T + T[:3, 3]
+    if obstacles.round[i]:
+        across = np.hypot(local[:, 0], local[:, 1]) - half_size[0]
+        past = np.stack([across, np.abs(local[:, 2]) - half_size[2]], axis=1)
+    else:
+        past = np.abs(local) - half_size
+    return np.linalg.norm(np.maximum(past, 0.0), axis=-1) + np.minimum(past.max(axis=-1), 0.0)
 
 
 def _self_distance(coarse: Spheres, frames: np.ndarray) -> np.ndarray:
@@ -245,33 +303,33 @@ def _in_hand(held: Held) -> tuple[RobotPart, ...]:
 
 def _spheres(bodies: Sequence[tuple[int, tuple[RobotPart, ...]]], cell: float) -> Spheres:
     """Spheres around all primitives of pairs of a frame, ascending, and its primitives."""
-    frames, centres, radii = [], [], []
+    frames, centres, radii, edges = [], [], [], []
     for frame, primitives in bodies:
         for primitive in primitives:
-            local, radius = _cover(primitive.kind, primitive.size, cell)
+            local, radius, steps = _cover(primitive.kind, primitive.size, cell)
             T = primitive.T_frame_primitive
             frames.append(np.full(len(local), frame))
             centres.append(local @ T[:3, :3].T + T[:3, 3])
             radii.append(np.full(len(local), radius))
-    return Spheres(
-        np.concatenate(frames), np.concatenate(centres).astype(np.float32), np.concatenate(radii).astype(np.float32)
-    )
+            edges.append(np.tile(T[:3, :3] * steps, (len(local), 1, 1)))
+    numbers = (np.concatenate(rows).astype(np.float32) for rows in (centres, radii, edges))
+    return Spheres(np.concatenate(frames), *numbers)
 
 
 @functools.cache
-def _cover(kind: str, size: tuple[float, ...], cell: float) -> tuple[np.ndarray, float]:
-    """Centres and radius of spheres that cover a primitive, in its own frame."""
+def _cover(kind: str, size: tuple[float, ...], cell: float) -> tuple[np.ndarray, float, np.ndarray]:
+    """Centres and radius of spheres that cover a primitive, in its own frame, and the edges of a box's cells."""
     if kind == "capsule":
         radius, half = size
         count = max(2, int(np.ceil(2 * half / cell)) + 1)
         z = np.linspace(-half, half, count)
         between = half / (count - 1)
-        return np.stack([0 * z, 0 * z, z], axis=1), float(np.hypot(radius, between))
+        return np.stack([0 * z, 0 * z, z], axis=1), float(np.hypot(radius, between)), np.zeros(3)
     counts = [max(1, int(np.ceil(2 * s / cell))) for s in size]
     steps = [2 * s / n for s, n in zip(size, counts, strict=True)]
     axes = [(np.arange(n) - (n - 1) / 2) * step for n, step in zip(counts, steps, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return grid, float(np.linalg.norm(steps)) / 2
+    return grid, float(np.linalg.norm(steps)) / 2, np.array(steps)
 
 
 def shows_arm(

@@ -21,6 +21,8 @@ from mechsearch_jax.runtime.errors import InputError, nearest
 FARTHEST = 2.0
 # Where the arm waits if nothing else is said [rad].
 HOME = np.array([0.0301, -1.4702, 0.0279, -2.4376, 0.1466, 2.3087, 0.7012], np.float32)
+# Share of the joints' limits that velocities reach on a robot if nothing else is said.
+SPEED = 0.3
 ArmModel = Literal["panda", "fr3"]
 Seven = tuple[float, float, float, float, float, float, float]
 # At its very end a joint may not move outwards at all; this is libfranka's tolerance, and keeps shares finite [rad/s].
@@ -128,7 +130,7 @@ class ArmConfig:
     # First, since the others are checked by it where settings are restored one by one; the gripper's text has it.
     model: ArmModel = dataclasses.field(default="panda", repr=False)
     home: tuple[float, ...] = tuple(round(float(q), 4) for q in HOME)
-    speed: float = 1.0
+    speed: float = SPEED
     # Searches are saved with a digest of this text, and may go on after the place has changed.
     place: tuple[float, ...] = dataclasses.field(default=(), repr=False)
 

@@ -15,9 +15,9 @@ import math
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Obstacles, clearance
+from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Obstacles, clearance, touched
 from mechsearch_jax.robot.arm_config import PANDA, Arm
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.robot.time_scaling import smooth_curve, timing, travelled
@@ -159,14 +159,16 @@ def free_motion(
         return FreeMotion(waits, float(clearance(body, obstacles, start[None]).free[0]), True)
     space = _space(path, body, obstacles, config)
     rows = timed_rows(respaced(path, WAYPOINTS), timestep, pace, least, arm)
-    if not straight and not space.allowed(_thinned(rows, config.step)).all():
+    few = rows[few_rows(rows, config.step)]
+    if not straight and not space.allowed(few).all():
         # The smooth curve cuts a corner and touches something: stop at each corner.
         pieces = [
             timed_rows(respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0, arm)
             for pair in itertools.pairwise(path)
         ]
         rows = np.concatenate(pieces)
-    nearest = clearance(body, obstacles, np.concatenate([start[None], _thinned(rows, config.step)])).free.min()
+        few = rows[few_rows(rows, config.step)]
+    nearest = clearance(body, obstacles, np.concatenate([start[None], few])).free.min()
     return FreeMotion(rows, float(nearest), straight)
 
 
@@ -185,20 +187,22 @@ def free_path(
     """
     ends = np.array([start, end], float)
     at_ends = clearance(body, obstacles, ends)
-    for name, free, inside in zip(("where it begins", "where it ends"), at_ends.free, at_ends.inside, strict=True):
+    for name, each, inside in zip(("where it begins", "where it ends"), at_ends.each, at_ends.inside, strict=True):
         if inside > config.deepest:
             raise InputError(
                 f"free motion: {name} the arm is {100 * inside:.0f} cm inside the shelf; take it out along its way in"
             )
-        if free <= 0.0:
-            raise InputError(f"free motion: {name} the arm touches the shelf, an object, the floor or itself")
+        if each.min() <= 0.0:
+            raise InputError(f"free motion: {name} the arm touches {touched(obstacles, each[None])}")
     space = _space(ends, body, obstacles, config)
     if space.passes(*ends):
         return ends
     rng = np.random.default_rng(config.seed)
     path = _connected(ends, space, config, rng, arm)
     if path is None:
-        raise InputError(f"free motion: no way around the obstacles was found in {config.attempts} attempts")
+        near = clearance(body, obstacles, _line(start, end, config.step)).each.min(axis=0) < space.least
+        what = " and ".join(dict.fromkeys(itertools.compress(obstacles.names, near))) or "the shelf's front"
+        raise InputError(f"free motion: no way around {what} was found in {config.attempts} attempts")
     return _shortened(path, space, config, rng)
 
 
@@ -215,15 +219,18 @@ def _line(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
     return start + np.linspace(0.0, 1.0, count + 1)[:, None] * (end - start)
 
 
-def _thinned(rows: np.ndarray, step: float) -> np.ndarray:
-    """Few rows of a motion, the last included, between which no point of the arm moves more than `step`."""
+def few_rows(rows: Float[np.ndarray, "n 7"], step: float) -> Int[np.ndarray, " m"]:
+    """Numbers of a few rows of a motion, the last included, between which no point of the arm moves more than `step`.
+
+    Where it moves farther from one row to the next, both are among them.
+    """
     way = np.concatenate([[0.0], np.cumsum(np.sum(np.abs(np.diff(rows, axis=0)) * REACH, axis=1))])
     kept, last = [], -math.inf
     for i in range(len(rows)):
         if i + 1 == len(rows) or way[i + 1] - last > step:
             kept.append(i)
             last = way[i]
-    return rows[kept]
+    return np.array(kept, int)
 
 
 def _connected(

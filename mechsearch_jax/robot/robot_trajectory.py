@@ -49,6 +49,22 @@ class Bounds:
 
 
 @dataclasses.dataclass(frozen=True)
+class Nearest:
+    """How near a motion comes to a body.
+
+    Attributes:
+      body: "object 4", "the target", "the shelf" (with the planner's margins), "the floor", or 'obstacle "camera"'.
+      distance: least distance of the arm, the hand and what it holds from it [m], at most 0.2; negative by how deep
+        they may enter it. Objects are their bounding boxes, where they stood before the action or are to be after it.
+      time: when it is least [s].
+    """
+
+    body: str
+    distance: float
+    time: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Report:
     """Properties of a trajectory before it is executed.
 
@@ -60,6 +76,8 @@ class Report:
       straight: whether the ways through free space are straight lines in joint space.
       ends_at_home: False if home is not free and the arm stops outside the shelf.
       place_fault: why the target stays in the hand though there is a place for it; empty if it does not.
+      nearest: how near the whole motion, the action in the shelf included, comes to each body, the nearest first.
+      intended: the same for what the action pushes or grasps, from the action's beginning to its end.
     """
 
     duration: float
@@ -71,6 +89,8 @@ class Report:
     straight: bool
     ends_at_home: bool
     place_fault: str = ""
+    nearest: tuple[Nearest, ...] = ()
+    intended: tuple[Nearest, ...] = ()
 
     def within(self, tolerance: float = 1e-3) -> bool:
         """Whether all joints stay within their limits, up to a tolerance for rounding."""
@@ -82,9 +102,18 @@ class Report:
             f"{self.duration:.1f} s; of the limits: {shares}; joints {self.position_margin:.2f} rad from theirs; "
             f"{1000 * self.clearance:.0f} mm from everything in free space"
             f"{'' if self.straight else ', around what is in the way'}"
+            f"{self._nearest}"
             f"{'' if self.ends_at_home else '; stops outside the shelf: the way home is not free'}"
             f"{self.place_fault and '; the target stays in the hand: '}{self.place_fault}"
         )
+
+    @property
+    def _nearest(self) -> str:
+        """What the whole motion comes nearest to, in words."""
+        if not self.nearest:
+            return ""
+        first = self.nearest[0]
+        return f"; nearest to {first.body}: {1000 * first.distance:.0f} mm after {first.time:.1f} s"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,6 +139,7 @@ class RobotTrajectory:
       events: what the hand does, in order; where an event `waits`, and where any ends, the arm stands still.
       place_fault: why the target stays in the hand though there is a place for it; empty if it does not.
       arm: that it was made for.
+      nearest, intended: as of its `Report`.
     """
 
     time: Float[np.ndarray, " t"]
@@ -127,6 +157,8 @@ class RobotTrajectory:
     events: tuple[HandEvent, ...] = ()
     place_fault: str = ""
     arm: Arm = PANDA
+    nearest: tuple[Nearest, ...] = ()
+    intended: tuple[Nearest, ...] = ()
 
     @property
     def put_down(self) -> int | None:
@@ -147,6 +179,8 @@ class RobotTrajectory:
             straight=self.straight,
             ends_at_home=self.ends_at_home,
             place_fault=self.place_fault,
+            nearest=self.nearest,
+            intended=self.intended,
         )
 
 

@@ -20,8 +20,9 @@ from mechsearch_jax.runtime.options import DEGREES, in_radians
 LIMIT = 2**18
 T = TypeVar("T")
 
-_BARE = re.compile(r"[A-Za-z0-9_-]{1,60}")
+_BARE = re.compile(r"[A-Za-z0-9_-]{1,60}( \d{1,6})?")
 _HEADER = re.compile(r"\s*\[\s*([A-Za-z0-9_-]+)\s*\]\s*(?:#.*)?$")
+_ITEM = re.compile(r"\s*\[\[\s*([A-Za-z0-9_-]+)\s*\]\]\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
 # The prefix of error messages of dataclasses.
 _CLASS = re.compile(r"^[A-Z]\w+: ")
@@ -34,7 +35,8 @@ class Document:
 
     Attributes:
       path: how messages name the file.
-      tables: its tables by name; "" holds the keys before the first table.
+      tables: its tables by name; "" holds the keys before the first table; those of an array by its name and their
+        numbers from 1, as "obstacle 2".
       lines: line numbers of tables and keys, by (table, "") and (table, key).
     """
 
@@ -53,8 +55,12 @@ def _quoted(name: str) -> str:
     return name if _BARE.fullmatch(name) else shown(name)
 
 
-def read_document(path: PathLike) -> Document:
+def read_document(path: PathLike, arrays: Sequence[str] = ()) -> Document:
     """Read a TOML file.
+
+    Args:
+      path: of the file.
+      arrays: names of which there may be several tables, each with its name in two brackets.
 
     Raises:
       InputError: it cannot be read, or is not TOML.
@@ -67,6 +73,10 @@ def read_document(path: PathLike) -> Document:
         line = _LINE.search(message)
         place = f"{path}:{line[1]}" if line else f"{path}"
         raise InputError(f"{place}: is not TOML ({_LINE.sub('', message)[:200]})") from error
+    for name in arrays:
+        parts = value.get(name)
+        if isinstance(parts, list) and all(isinstance(part, dict) for part in parts):
+            value |= {f"{name} {number}": part for number, part in enumerate(value.pop(name), start=1)}
     tables = {name: part for name, part in value.items() if isinstance(part, dict)}
     tables[""] = {name: part for name, part in value.items() if name not in tables}
     return Document(str(path), tables, _lines(text, tables))
@@ -75,13 +85,18 @@ def read_document(path: PathLike) -> Document:
 def _lines(text: str, tables: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], int]:
     """Line numbers of the tables and keys that are written plainly; others, such as quoted keys, have none."""
     lines: dict[tuple[str, str], int] = {}
+    counts: dict[str, int] = {}
     table = ""
     for number, line in enumerate(text.splitlines(), start=1):
-        header, key = _HEADER.match(line), _KEY.match(line)
-        if header and header[1] in tables:
+        header, key, item = _HEADER.match(line), _KEY.match(line), _ITEM.match(line)
+        if item:
+            counts[item[1]] = counts.get(item[1], 0) + 1
+            table = f"{item[1]} {counts[item[1]]}"
+            lines[table, ""] = number
+        elif header and header[1] in tables:
             table = header[1]
             lines.setdefault((table, ""), number)
-        elif key and key[1] in tables[table]:
+        elif key and key[1] in tables.get(table, ()):
             lines.setdefault((table, key[1]), number)
     return lines
 

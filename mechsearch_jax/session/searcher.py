@@ -471,9 +471,10 @@ class Searcher:
 
     @property
     def _motions(self) -> TrajectoryConfig:
-        """How motions are made: as given, with the workcell's hand and place where these are not."""
+        """How motions are made: as given, with the workcell's obstacles, and its hand and place where these are not."""
         config, cell = self._trajectories or TrajectoryConfig(), self.workcell
-        return dataclasses.replace(config, hand=config.hand or cell.hand, place=config.place or cell.arm.place)
+        hand, place = config.hand or cell.hand, config.place or cell.arm.place
+        return dataclasses.replace(config, hand=hand, place=place, obstacles=(*config.obstacles, *cell.bodies))
 
     def _within_limit(self, motion: Motion, state: SearchState) -> Motion:
         """The motion if the limit of actions allows it; beyond it only the target is taken out, as in an episode."""
@@ -543,7 +544,7 @@ class Searcher:
     def load(self, path: PathLike) -> None:
         """Continue a search that was saved by a searcher with the same workcell, configuration and seed.
 
-        The hand, the camera's pose, the arm's speed and the target's place may have changed.
+        The hand, the camera's pose, the arm's speed, obstacles and the target's place may have changed.
 
         Raises:
           InputError: the file cannot be read, was not made by `save`, or belongs to another searcher, or to trials that
@@ -562,8 +563,8 @@ class Searcher:
 
     @functools.cached_property
     def _digest(self) -> str:
-        """SHA-256 of everything that a saved state depends on; not of the hand, the camera's pose, the arm's speed, or
-        the target's place."""
+        """SHA-256 of everything that a saved state depends on; not of the hand, the camera's pose, the arm's speed,
+        obstacles, or the target's place."""
         cell, camera = self.workcell, Camera()
         camera = dataclasses.replace(cell.camera, rotation=camera.rotation, position=camera.position)
         arm = dataclasses.replace(cell.arm, speed=1.0, place=())

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.kinds.nothing import no_action
@@ -22,12 +23,14 @@ from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import (
     HAND_FRAME,
+    TARGET,
     ArmBody,
     Held,
     Obstacles,
     clearance,
     link_poses,
     tip_positions,
+    touched,
 )
 from mechsearch_jax.robot.arm_config import check_joints, check_place
 from mechsearch_jax.robot.entry import ways_in
@@ -36,10 +39,12 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandConfig, HandMove, checked_width, longest_way, stroke
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
-from mechsearch_jax.robot.robot_trajectory import Bounds, Part, RobotTrajectory, derivatives
+from mechsearch_jax.robot.nearest import nearest_rows
+from mechsearch_jax.robot.robot_trajectory import Bounds, Nearest, Part, RobotTrajectory, derivatives
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session.placing import PlaceWay, place_ways
+from mechsearch_jax.workspace.obstacle import Obstacle
 from mechsearch_jax.workspace.target_view import body_at
 
 # Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
@@ -68,6 +73,7 @@ class TrajectoryConfig:
       hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
       place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
       without_gain: whether a `Searcher` also hands out motions of which no lower cost is expected.
+      obstacles: what else the arm keeps clear of; a `Searcher` adds its workcell's, the camera's body among them.
     """
 
     motion: MotionConfig | None = None
@@ -77,6 +83,7 @@ class TrajectoryConfig:
     hand: HandConfig | None = None
     place: tuple[float, ...] = ()
     without_gain: bool = False
+    obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self):
         check_place("TrajectoryConfig: place", self.place)
@@ -84,11 +91,13 @@ class TrajectoryConfig:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Stage:
-    """Rows of one part, the first one timestep after the last row of the part before, and the free ways among them."""
+    """Rows of one part, the first one timestep after the last row of the part before, the free ways among them, and
+    where the target is once the hand has put it down."""
 
     part: Part
     rows: Rows
     way: FreeMotion | None = None
+    placed: np.ndarray | None = None
 
 
 @in_own_settings
@@ -107,10 +116,10 @@ def whole_trajectory(
     """The trajectory from the present joints through a decision's action and home; not to be called inside `jit`.
 
     The ways through free space are straight in joint space, or planned if something is in the way: the whole arm with
-    what it holds keeps clear of the shelf, of the observed objects, of itself and, on the way home, of the predicted
-    objects. After a retrieval the hand puts the target down at `config.place`; if there is none, or it cannot, it
-    brings the target home, or stops outside the shelf if the target would hit something at home. The trajectory of no
-    action is the way home.
+    what it holds keeps clear of the shelf, of the observed objects, of `config.obstacles`, of itself and, on the way
+    home, of the predicted objects. In the action, too, it touches none of the obstacles. After a retrieval the hand
+    puts the target down at `config.place`; if there is none, or it cannot, it brings the target home, or stops outside
+    the shelf if the target would hit something at home. The trajectory of no action is the way home.
 
     The fingers move as a real hand does: what it does is in `events`, and the arm stands still where one has to have
     ended. The first, which opens or closes them for the action, is there whatever `width` is.
@@ -131,7 +140,7 @@ def whole_trajectory(
 
     Raises:
       InputError: an argument is impossible, recognition is too doubtful, the arm does not reach all of the action, or
-        the way to it or home is blocked.
+        touches an obstacle in it, or the way to it or home is blocked.
     """
     config, observation = config or TrajectoryConfig(), observation.with_boxes()
     home = np.array(HOME if home is None else home, float)
@@ -196,6 +205,7 @@ class _Assembly:
         self.config, self.speed, self.hand = config, speed, config.hand or HandConfig()
         self.motion = motion_with(problem.gripper, config.motion)
         self.kind: Kind = kind_of(int(action.kind))
+        self._known: dict[_Stage, list[tuple[bool, Nearest]]] = {}
 
     def run(self, joints: np.ndarray, home: np.ndarray, width: float | None) -> RobotTrajectory:
         widest = self.problem.gripper.max_opening
@@ -211,6 +221,7 @@ class _Assembly:
         stages = [self._way_there(joints, begin[:7], present, opened, self.hand.time(farthest))]
         grip = grip_for(self.problem, self.observation, self.action)
         stages.append(_Stage(Part.ACTION, acting(reference, grip, self.motion, self.hand, self.speed)))
+        self._check_obstacles(stages[-1])
         between = self._between(stages[-1].rows)
 
         fault, at_home = "", True
@@ -302,8 +313,10 @@ class _Assembly:
         force, pace, timestep = float(acted.force[-1]), self.speed * self.motion.carry_pace, self.motion.timestep
         around, body = self._obstacles(afterwards=True), ArmBody.of(opened)
         free = clearance(body, around, np.concatenate([way.down, way.back]))
-        if free.free.min() <= 0.0 or free.inside.max() > 0.0:
-            raise InputError("place: the arm touches something there")
+        if free.free.min() <= 0.0:
+            raise InputError(f"place: there the arm touches {touched(around, free.each)}")
+        if free.inside.max() > 0.0:
+            raise InputError("place: there the arm is inside the shelf")
         there = self._free(
             "the way to the place",
             acted.position[-1],
@@ -324,8 +337,8 @@ class _Assembly:
             around = self._obstacles(afterwards=True, placed=way.T_world_placed)
         back = self._free("the way home from the place", way.back[-1], home, body, around)
         return [
-            _Stage(Part.PLACE, joined(parts, timestep), there),
-            self._travel(Part.WAY_HOME, back, opened),
+            _Stage(Part.PLACE, joined(parts, timestep), there, way.T_world_placed),
+            dataclasses.replace(self._travel(Part.WAY_HOME, back, opened), placed=way.T_world_placed),
         ]
 
     def _reference(self) -> Reference | None:
@@ -355,11 +368,15 @@ class _Assembly:
             scenes.append(self.after)
         # A target that the action takes out, pushes or carries leaves its place.
         moved = self.kind.takes_target or (self.kind.moves_object and int(self.action.object) >= seen.capacity)
+        target = []
         if bool(self.observation.target_visible) and not ((afterwards or without is not None) and moved):
-            scenes.append(self._target_scene(target_pose(self.problem, self.observation)))
+            target.append(self._target_scene(target_pose(self.problem, self.observation)))
         if placed is not None:
-            scenes.append(self._target_scene(placed))
-        return Obstacles.of(self.problem.shelf, tuple(scenes), self.config.free.floor)
+            target.append(self._target_scene(placed))
+        config = self.config
+        return Obstacles.of(
+            self.problem.shelf, tuple(scenes), config.free.floor, target=tuple(target), bodies=config.obstacles
+        )
 
     def _target_scene(self, pose: np.ndarray) -> Superquadrics:
         """The target at a pose, as a scene of one object."""
@@ -418,10 +435,78 @@ class _Assembly:
             return np.inf
         body = ArmBody.of(self.problem.gripper.max_opening, self._held())
         obstacles = self._obstacles(without=int(self.action.object))
-        free = float(clearance(body, obstacles, acted.position[carries]).free.min())
+        distances = clearance(body, obstacles, acted.position[carries])
+        free = float(distances.free.min())
         if free <= 0.0:
-            raise InputError(f"{self.kind.name}: the arm touches something in front of the shelf; decide anew")
+            what = touched(obstacles, distances.each)
+            raise InputError(f"{self.kind.name}: in front of the shelf the arm touches {what}; decide anew")
         return free
+
+    @property
+    def _acted_on(self) -> str | None:
+        """What the action pushes or grasps, as messages call it."""
+        number = int(self.action.object)
+        if self.kind.takes_target or (self.kind.moves_object and number >= self.observation.objects.capacity):
+            return TARGET
+        return f"object {number}" if self.kind.moves_object else None
+
+    def _check_obstacles(self, action: _Stage) -> None:
+        """Check that the arm touches no obstacle of the cell in the action.
+
+        Raises:
+          InputError: it does.
+        """
+        bodies = {f'obstacle "{body.name}"' for body in self.config.obstacles}
+        touches = [near for near in self._nearest([action])[0] if near.body in bodies and near.distance <= 0.0]
+        if touches:
+            name, depth = touches[0].body, -1000 * touches[0].distance
+            raise InputError(f"{self.kind.name}: the arm would pass {depth:.0f} mm through {name}; decide anew")
+
+    def _nearest(self, stages: list[_Stage]) -> tuple[tuple[Nearest, ...], tuple[Nearest, ...]]:
+        """How near the stages come to everything, and to what the action is for while it lasts, the nearest first."""
+        least: tuple[dict[str, Nearest], dict[str, Nearest]] = {}, {}
+        before = 0.0
+        for stage in stages:
+            if stage not in self._known:
+                self._known[stage] = self._nearest_in(stage)
+            for intended, near in self._known[stage]:
+                known = least[intended].get(near.body)
+                if known is None or near.distance < known.distance:
+                    least[intended][near.body] = dataclasses.replace(near, time=before + near.time)
+            before += len(stage.rows.width) * self.motion.timestep
+        nearest, contacts = (tuple(sorted(each.values(), key=lambda near: near.distance)) for each in least)
+        return nearest, contacts
+
+    def _nearest_in(self, stage: _Stage) -> list[tuple[bool, Nearest]]:
+        """How near a stage comes to each body in each of its phases, and whether that is what the action is for."""
+        found = []
+        acts, holds = stage.part in (Part.ACTION, Part.PLACE), stage.rows.force > 0.0
+        # Before, while and after the hand holds something.
+        phases = np.where(holds, 1, 2 * np.maximum.accumulate(holds))
+        for phase in np.unique(phases):
+            rows = np.flatnonzero(phases == phase)
+            for name, distance, row in self._nearest_rows(stage, int(phase), rows):
+                near = Nearest(name, distance, float(rows[row] + 1) * self.motion.timestep)
+                found.append((acts and name == self._acted_on, near))
+        return found
+
+    def _nearest_rows(self, stage: _Stage, phase: int, rows: np.ndarray) -> list[tuple[str, float, int]]:
+        """Each body, the least distance from it in rows of a phase of a stage [m], and in which of them."""
+        acts, holding = stage.part in (Part.ACTION, Part.PLACE), phase == 1
+        capacity = self.observation.objects.capacity
+        carried = capacity if self.kind.takes_target else int(self.action.object)
+        obstacles = self._obstacles(
+            afterwards=phase == 2 or stage.part in (Part.PLACE, Part.WAY_HOME),
+            without=carried if holding else None,
+            placed=None if holding else stage.placed,
+        )
+        q, opening = stage.rows.position[rows], float(stage.rows.width[rows].max())
+        near = nearest_rows(ArmBody.of(opening, self._held() if holding else None), obstacles, q)
+        if holding and acts:
+            # What is held stands on the shelf, or the floor, before and after.
+            bare = nearest_rows(ArmBody.of(opening), obstacles.bare, q)
+            near = [*bare, *near[len(bare) :]]
+        return near
 
     def _joined(
         self,
@@ -437,6 +522,7 @@ class _Assembly:
         position = np.concatenate([joints[None], rows.position])
         velocity, acceleration = derivatives(position, timestep, rows.rests)
         ways = [stage.way for stage in stages if stage.way is not None]
+        nearest, intended = self._nearest(stages)
         return RobotTrajectory(
             time=np.arange(len(position)) * timestep,
             position=position,
@@ -453,6 +539,8 @@ class _Assembly:
             events=rows.events,
             place_fault=fault,
             arm=self.motion.gripper.arm,
+            nearest=nearest,
+            intended=intended,
         )
 
 

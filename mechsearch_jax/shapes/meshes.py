@@ -147,6 +147,47 @@ def _thickened(piece: Piece) -> Piece:
     return dataclasses.replace(piece, vertices=tuple((x, y, z) for x, y, z in rows))
 
 
+def box_around(
+    path: Path, scale: float, where: str
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """The smallest box around a mesh file, turned as it may be.
+
+    Args:
+      path, scale, where: as of `convex_pieces`.
+
+    Returns:
+      Its axes as columns, its centre [m] and its sizes along them [m], in the mesh's frame.
+
+    Raises:
+      InputError: it cannot be read, or is no mesh.
+    """
+    _content(path, where)
+    loaded = _surface(path, where)
+    loaded.apply_scale(scale)
+    if not np.isfinite(loaded.vertices).all():
+        raise InputError(f"{where}: {path} holds vertices that are not finite numbers; mend the mesh")
+    import trimesh
+
+    try:
+        T_box_mesh, size = trimesh.bounds.oriented_bounds(loaded)
+    except Exception as error:
+        raise InputError(f"{where}: {path} has no box around it ({error}); give the mesh of a body") from None
+    T = np.linalg.inv(T_box_mesh)
+    return T[:3, :3], T[:3, 3], np.asarray(size, float)
+
+
+def _content(path: Path, where: str) -> bytes:
+    """The bytes of a mesh file."""
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"{where}: {path} is larger than {LARGEST_FILE >> 20} MiB; simplify the mesh")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{where}: {path} cannot be read ({error.strerror}); a path in a file counts from that file's folder"
+        ) from None
+
+
 def _surface(path: Path, where: str):
     """The surface of a mesh file, in which vertices at the same place are one: files have several for textures."""
     import trimesh
@@ -289,12 +330,5 @@ def convex_pieces(path: Path, scale: float, where: str) -> tuple[Piece, ...]:
     Raises:
       InputError: it cannot be read, is no mesh, has flat parts, or `coacd` is needed and not installed.
     """
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{where}: {path} is larger than {LARGEST_FILE >> 20} MiB; simplify the mesh")
-        content = hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"{where}: {path} cannot be read ({error.strerror}); a path in a file counts from that file's folder"
-        ) from None
+    content = hashlib.sha256(_content(path, where)).hexdigest()
     return _read(path, content, scale, where)

@@ -69,13 +69,7 @@ class Camera:
             check_range(f"Camera: {name}", getattr(self, name), 1e-3, 100 * LARGEST, "pixels")
         for name in ("cx", "cy"):
             check_range(f"Camera: {name}", getattr(self, name), -10 * LARGEST, 10 * LARGEST, "pixels")
-        rotation = np.array(self.rotation, float)
-        # Products of numbers far above 1 may overflow.
-        small = rotation.shape == (3, 3) and bool((np.abs(rotation) < 2.0).all())
-        if not small or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
-            raise InputError("Camera: rotation must be a rotation matrix, three orthonormal rows")
-        if np.linalg.det(rotation) < 0:
-            raise InputError("Camera: rotation mirrors; its columns are the camera's x, y and z, a right-handed frame")
+        check_rotation("Camera", self.rotation)
         for axis, value in zip("xyz", self.position, strict=True):
             check_range(f"Camera: position {axis}", value, -FARTHEST, FARTHEST, "m")
         # Convert to one type, for other types would be compiled for anew.
@@ -99,6 +93,23 @@ class Camera:
             fy=self.fy / factor,
             cx=self.cx / factor,
             cy=self.cy / factor,
+        )
+
+
+def check_rotation(name: str, rotation: Any) -> None:
+    """Check that rows are a rotation matrix.
+
+    Raises:
+      InputError: they are not; the message begins with the name.
+    """
+    R = np.array(rotation, float)
+    # Products of numbers far above 1 may overflow.
+    small = R.shape == (3, 3) and bool((np.abs(R) < 2.0).all())
+    if not small or not np.allclose(R @ R.T, np.eye(3), atol=1e-4):
+        raise InputError(f"{name}: rotation must be a rotation matrix, three orthonormal rows")
+    if np.linalg.det(R) < 0:
+        raise InputError(
+            f"{name}: rotation mirrors; its columns are the {name.lower()}'s x, y and z, a right-handed frame"
         )
 
 

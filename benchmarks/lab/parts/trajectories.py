@@ -147,8 +147,9 @@ def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list
         seconds, report = time.perf_counter() - begin, trajectory.report()
         follower = follower or Follower(setting, float(trajectory.time[1]))
         fields: dict[str, Any] = dataclasses.asdict(report)
-        # No target has a place here.
-        del fields["place_fault"]
+        # No target has a place here, and rows hold numbers.
+        for name in ("place_fault", "nearest", "intended"):
+            del fields[name]
         tip_error = follower.tip_error(trajectory)
         rows.append(
             TrajectoryRow(scene.name, kind, None, seconds, **fields, within=report.within(), tip_error=tip_error)
