@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.images.cloud import above_board, cloud_of, hanging, middle, resample, surfaces
-from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
@@ -44,7 +44,8 @@ class Segmenter(Protocol):
           of_target: the target's pixels.
 
         Returns:
-          Labels as in `images.labels`, with at most eight segments, 0 to 7; the target's pixels are OTHER.
+          Labels as in `images.labels`, with at most as many segments as the recogniser has slots, from 0; the
+          target's pixels are OTHER.
         """
         ...
 
@@ -57,19 +58,22 @@ def _squares(a: Array, b: Array) -> Array:
 def labels_of(logits: Float[Array, "p classes"]) -> Int[Array, " p"]:
     """The likeliest label of each point: an instance's number, or OTHER for the last class."""
     best = jnp.argmax(logits, axis=-1)
-    return jnp.where(best == INSTANCES, OTHER, best).astype(jnp.int8)
+    return jnp.where(best == logits.shape[-1] - 1, OTHER, best).astype(jnp.int8)
 
 
-@jax.jit
-def clean_up(points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"]) -> Int[Array, " p"]:
+@functools.partial(jax.jit, static_argnames="count")
+def clean_up(
+    points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"], count: int
+) -> Int[Array, " p"]:
     """Labels after neighbours voted and small segments were merged, int8; OTHER where `valid` is false.
 
     Args:
       points: [m].
       labels: instances' numbers, or OTHER.
       valid: which points exist.
+      count: of instances; static.
     """
-    instances = jnp.arange(INSTANCES)
+    instances = jnp.arange(count)
     square = jnp.where(valid[None, :], _squares(points, points), jnp.inf)
     nearness, nearest = jax.lax.top_k(-square, NEIGHBOURS)
     votes_count = (-nearness < REACH**2)[..., None]
@@ -132,16 +136,18 @@ def spread_labels(
     return jnp.where(~measured, MISSING, jnp.where(candidates, nearest_label, FREE)).astype(jnp.int8)
 
 
-def leave_out_smallest(labels: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """Labels with the numbers 0 to `INSTANCES - 2`: the smallest segment becomes OTHER if there are `INSTANCES`.
+def leave_out_smallest(labels: Int[Array, "h w"], count: int, capacity: int) -> Int[Array, "h w"]:
+    """Labels with the numbers 0 to `capacity - 1`: of `count` segments the smallest become OTHER.
 
-    The last segment takes the number of the smallest, or of an absent one.
+    Later segments take their numbers, or those of absent ones.
     """
-    last = INSTANCES - 1
-    pixels = jnp.sum(labels[..., None] == jnp.arange(INSTANCES).reshape(1, 1, -1), axis=(0, 1))
-    smallest = jnp.argmin(pixels)
-    rest = jnp.where(labels == last, smallest, labels)
-    return jnp.where(labels == smallest, OTHER, rest).astype(jnp.int8)
+    numbers = jnp.arange(count)
+    pixels = jnp.sum(labels[..., None] == numbers.reshape(1, 1, -1), axis=(0, 1))
+    kept = jnp.zeros(count, bool).at[jnp.argsort(pixels)[max(count - capacity, 0) :]].set(True)
+    later = kept & (numbers >= capacity)
+    free = jnp.argsort(kept[:capacity])
+    number = jnp.where(later, free[jnp.cumsum(later) - 1], jnp.where(kept, numbers, OTHER))
+    return jnp.where(labels >= 0, number[labels], labels).astype(jnp.int8)
 
 
 class NetworkSegmenter(PyTreeNode):
@@ -151,31 +157,47 @@ class NetworkSegmenter(PyTreeNode):
       parameters: of the network.
       network: static.
       view: camera and shelf in its training, if its card records them; static.
+      capacity: the most segments; static. If the network tells fewer instances apart, what it leaves is segmented once
+        more.
     """
 
     parameters: Any
     network: SegmentationNetwork = static()
     view: TrainedView | None = static(default=None)
+    capacity: int = static(default=CAPACITY)
 
     @classmethod
-    def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
-        """The segmenter with the given weights; the package's if None."""
+    def of(cls, weights: Weights | None = None, capacity: int = CAPACITY) -> NetworkSegmenter:
+        """The segmenter with the given weights, the package's if None, of at most so many segments."""
         from mechsearch_jax.networks.weights import shipped_weights
 
         weights = weights or shipped_weights("segmentation")
-        return cls(weights.parameters, cast("SegmentationNetwork", weights.network), weights.view)
+        return cls(weights.parameters, cast("SegmentationNetwork", weights.network), weights.view, capacity)
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
-        from mechsearch_jax.networks.segmentation import apply_network
-
         objects = above_board(shelf, points) & ~of_target
         surface = surfaces(points, objects)
         objects &= ~hanging(shelf, points, objects, surface)
+        labels, count = self._segmented(key, shelf, points, objects, surface)
+        total = count
+        if self.capacity >= count:
+            left = objects & (labels == OTHER)
+            more, _ = self._segmented(jax.random.fold_in(key, 1), shelf, points, left, surface)
+            labels, total = jnp.where(left & (more >= 0), more + count, labels), 2 * count
+        labels = jnp.where(of_target & (labels != MISSING), OTHER, labels)
+        return leave_out_smallest(labels, total, self.capacity)
+
+    def _segmented(
+        self, key: Array, shelf: Shelf, points: Array, objects: Bool[Array, "h w"], surface: Int[Array, "h w"]
+    ) -> tuple[Int[Array, "h w"], int]:
+        """Labels of the pixels of objects, and the number of instances that the network tells apart."""
+        from mechsearch_jax.networks.segmentation import apply_network
+
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface.reshape(-1))
         output = apply_network(self.network, self.parameters, self._as_trained(shelf, cloud.points)[None])
-        labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
-        image_labels = spread_labels(points, objects, cloud.points, labels)
-        return leave_out_smallest(jnp.where(of_target & (image_labels != MISSING), OTHER, image_labels))
+        count = output.logits.shape[-1] - 1
+        labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid, count)
+        return spread_labels(points, objects, cloud.points, labels), count
 
     def _as_trained(self, shelf: Shelf, points: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
         """The points shifted as if the shelf stood where it stood in training, the only place the network knows."""

@@ -13,6 +13,7 @@ from mechsearch_jax.config.config import OPTIONS, Config
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
+from mechsearch_jax.images.labels import CAPACITY, check_capacity
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
@@ -78,13 +79,15 @@ class Settings:
 
 # The keys of the target's table that are the workcell's `colour` and `hue_tolerance`; all others are of the `Target`.
 COLOUR, HUE_TOLERANCE = "colour", "hue_tolerance"
+# The key of the objects' table that is the workcell's.
+ROOM = "capacity"
 
 # The defaults of a file's tables, without the planner's.
 _PARTS: Mapping[str, Any] = {
     **{
         field.name: getattr(Workcell(), field.name)
         for field in dataclasses.fields(Workcell)
-        if field.name not in ("colour", "hue_tolerance")
+        if field.name not in ("colour", "hue_tolerance", ROOM)
     },
     "base": Base(),
     "objects": ObjectSizes(),
@@ -103,6 +106,7 @@ def tables() -> dict[str, dict[str, Any]]:
     }
     parts["target"].pop("compound")
     parts["gripper"].pop("arm")
+    parts["objects"][ROOM] = CAPACITY
     parts["target"] |= _MADE_OF | {COLOUR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
@@ -128,6 +132,7 @@ def load_settings(path: PathLike) -> Settings:
         begin = ", ".join(f"[{table}]" for table in names)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
     detector, document = _detector(document)
+    room, document = _room(document)
     base = with_table(document, "base", Base())
     x, y, z = base.position
     document = _with_moved_place(document, (-x, -y, -z))
@@ -144,7 +149,7 @@ def load_settings(path: PathLike) -> Settings:
         document,
         "target",
         {"inset": target.inset},
-        lambda given: Workcell(target=target if given else Target(), **detector, **parts),
+        lambda given: Workcell(target=target if given else Target(), **detector, **room, **parts),
     )
     return _with_planner(document, Settings(workcell, objects))
 
@@ -181,6 +186,14 @@ def _detector(document: Document) -> tuple[dict[str, Any], Document]:
     rest = {key: value for key, value in table.items() if key not in names}
     without = dataclasses.replace(document, tables={**document.tables, "target": rest})
     return {names[key]: value for key, value in given.items()}, without
+
+
+def _room(document: Document) -> tuple[dict[str, int], Document]:
+    """How many objects the workcell has room for, and the document without it."""
+    rest = dict(document.tables.get("objects", {}))
+    given = {ROOM: checked(rest.pop(ROOM), int, document.where("objects", ROOM))} if ROOM in rest else {}
+    apply(document, "objects", given, lambda values: check_capacity(values.get(ROOM, CAPACITY)))
+    return given, dataclasses.replace(document, tables={**document.tables, "objects": rest})
 
 
 def _rgb(document: Document, value: Any) -> tuple[float, float, float]:

@@ -8,6 +8,7 @@ from typing import Any
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.images.colour import HUE, RED, TargetColour
+from mechsearch_jax.images.labels import CAPACITY, check_capacity
 from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import PANDA, ArmConfig, ArmModel
@@ -31,6 +32,7 @@ class Workcell:
       colour: of the target in colour images: red, green and blue in 0 to 1. The planner's programs do not depend on it.
       hand: how the real hand is used.
       hue_tolerance: by how much hues may differ from the target's and count as equal [degrees].
+      capacity: number of objects that recognition and planner can hold, 1 to 16.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -45,9 +47,11 @@ class Workcell:
     hand: HandConfig = dataclasses.field(default_factory=HandConfig, repr=False)
     # Not in the representation, so that searches that were saved before it existed go on.
     hue_tolerance: float = dataclasses.field(default=HUE, repr=False)
+    capacity: int = dataclasses.field(default=CAPACITY, repr=False)
 
     def __post_init__(self):
         TargetColour.lit(self.colour, self.hue_tolerance)
+        check_capacity(self.capacity, "Workcell: capacity")
         # What plans is given the gripper, and with it the arm.
         if self.gripper.arm not in (PANDA, self.arm.arm):
             raise InputError(
