@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class ImageFiles:
             raise InputError("plan: --topics are those of --bag; give it, too")
 
     def load(
-        self, config: Path | None, camera: Camera, capacity: int
+        self, config: Path | None, camera: Camera, capacity: int = CAPACITY
     ) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
         """The arguments of `Searcher.next`, their camera, and warnings about them.
 
