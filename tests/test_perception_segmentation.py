@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks import segmentation as networks
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, leave_out_smallest
@@ -50,7 +50,7 @@ def labels_of(monkeypatch, shelf, points, view=None):
 
     def network(_, parameters, cloud):
         nearest = jnp.argmin(jnp.abs(cloud[0][:, None, 1] - jnp.asarray(Y)[None]), axis=1)
-        logits = jax.nn.one_hot(jnp.asarray(INSTANCE)[nearest], networks.INSTANCES + 1)
+        logits = jax.nn.one_hot(jnp.asarray(INSTANCE)[nearest], INSTANCES + 1)
         return types.SimpleNamespace(logits=logits[None, None])
 
     monkeypatch.setattr(networks, "apply_network", network)

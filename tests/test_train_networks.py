@@ -19,7 +19,6 @@ from mechsearch_jax.networks import recognition as model
 from mechsearch_jax.networks import segmentation as layers
 from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
 from mechsearch_jax.networks.segmentation import (
-    INSTANCES,
     SegmentationConfig,
     SegmentationNetwork,
     nearest_neighbours,
@@ -228,9 +227,9 @@ def test_clean_up_removes_specks_and_dissolves_small_segments():
     labels = truth.copy()
     labels[[3, 50, 120, 190]] = [1, 7, 4, 6]
     labels[200:] = 2
-    clean = np.asarray(clean_up(jnp.asarray(points), jnp.asarray(labels), jnp.ones(203, bool), INSTANCES))
+    clean = np.asarray(clean_up(jnp.asarray(points), jnp.asarray(labels), jnp.ones(203, bool)))
     assert np.array_equal(clean, truth)
-    gone = np.asarray(clean_up(jnp.asarray(points), jnp.asarray(labels), jnp.arange(203) < 100, INSTANCES))
+    gone = np.asarray(clean_up(jnp.asarray(points), jnp.asarray(labels), jnp.arange(203) < 100))
     assert (gone[100:] == OTHER).all()
     assert np.array_equal(gone[:100], truth[:100])
 

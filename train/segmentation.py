@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.images.cloud import POINTS, View, cloud_of, resample, shelf_view
-from mechsearch_jax.images.labels import OTHER
+from mechsearch_jax.images.labels import INSTANCES, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
-from mechsearch_jax.networks.segmentation import INSTANCES, SegmentationConfig, SegmentationNetwork, apply_network
+from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
@@ -199,7 +199,7 @@ def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int
     output = apply_network(SegmentationNetwork(task.network), parameters, examples.points)
     raw = labels_of(output.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
     valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
-    clean = jax.vmap(functools.partial(clean_up, count=INSTANCES))(examples.points, raw, valid)
+    clean = jax.vmap(clean_up)(examples.points, raw, valid)
     raw, present = jax.vmap(instance_overlaps)(raw, examples.labels)
     clean, _ = jax.vmap(instance_overlaps)(clean, examples.labels)
     # `worth` has no entry for the target.

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.images.cloud import BLOCK, View, above_board, density, shelf_view, thinned_view
 from mechsearch_jax.images.detection import coloured_pixels
-from mechsearch_jax.images.labels import CAPACITY, MISSING
+from mechsearch_jax.images.labels import CAPACITY, MISSING, more_room
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, measured

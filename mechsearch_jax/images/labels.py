@@ -16,6 +16,9 @@ CAPACITY, MOST = 8, 16
 """The number of objects that recognition can hold if nothing else is said, and the largest that can be said. A mask may
 name the target beside them."""
 
+INSTANCES = 9
+"""The instances that the segmentation network tells apart."""
+
 
 def more_room(capacity: int) -> str:
     """The end of a message that there are too many objects: how to make room for more."""

@@ -18,12 +18,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mechsearch_jax.images.labels import INSTANCES
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.pytree import PyTreeNode
 
-# Instances that it tells apart.
-INSTANCES = 9
 # Origin of the network's frame, the middle of the shelf's space [m].
 MIDDLE = (0.6, 0.1, 0.5)
 # Unrolled iterations over the neighbours in `strongest_neighbour`.

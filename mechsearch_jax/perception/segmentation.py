@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.images.cloud import above_board, cloud_of, hanging, middle, resample, surfaces
-from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 # included, in so many rounds; points of segments of fewer than `LEAST_SEGMENT` points take the label of the nearest
 # other segment. Points without a label within `REACH` become OTHER.
 NEIGHBOURS, ROUNDS, LEAST_SEGMENT, REACH = 9, 1, 8, 0.02
+# Smaller surfaces do not count where those of an image are halved [pixels].
+SURFACE = 60
 # Parts of a cloud in which the nearest point is searched for, if they are of equal size.
 _PARTS = 64
 
@@ -58,22 +60,19 @@ def _squares(a: Array, b: Array) -> Array:
 def labels_of(logits: Float[Array, "p classes"]) -> Int[Array, " p"]:
     """The likeliest label of each point: an instance's number, or OTHER for the last class."""
     best = jnp.argmax(logits, axis=-1)
-    return jnp.where(best == logits.shape[-1] - 1, OTHER, best).astype(jnp.int8)
+    return jnp.where(best == INSTANCES, OTHER, best).astype(jnp.int8)
 
 
-@functools.partial(jax.jit, static_argnames="count")
-def clean_up(
-    points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"], count: int
-) -> Int[Array, " p"]:
+@jax.jit
+def clean_up(points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"]) -> Int[Array, " p"]:
     """Labels after neighbours voted and small segments were merged, int8; OTHER where `valid` is false.
 
     Args:
       points: [m].
       labels: instances' numbers, or OTHER.
       valid: which points exist.
-      count: of instances; static.
     """
-    instances = jnp.arange(count)
+    instances = jnp.arange(INSTANCES)
     square = jnp.where(valid[None, :], _squares(points, points), jnp.inf)
     nearness, nearest = jax.lax.top_k(-square, NEIGHBOURS)
     votes_count = (-nearness < REACH**2)[..., None]
@@ -150,6 +149,21 @@ def leave_out_smallest(labels: Int[Array, "h w"], count: int, capacity: int) -> 
     return jnp.where(labels >= 0, number[labels], labels).astype(jnp.int8)
 
 
+def on_the_right(objects: Bool[Array, "h w"], surface: Int[Array, "h w"]) -> Bool[Array, "h w"]:
+    """The pixels of objects whose surfaces are farther to the right than most: in the image about half of the things.
+
+    Args:
+      objects: pixels of objects.
+      surface: numbers of their surfaces, below the number of pixels.
+    """
+    number, there = surface.reshape(-1), objects.reshape(-1).astype(jnp.float32)
+    column = jnp.broadcast_to(jnp.arange(objects.shape[1], dtype=jnp.float32)[None], objects.shape).reshape(-1)
+    size, total = (jnp.zeros(number.size).at[number].add(weight) for weight in (there, there * column))
+    middle = total / jnp.maximum(size, 1.0)
+    half = jnp.nanmedian(jnp.where(size >= SURFACE, middle, jnp.nan))
+    return objects & (middle > half)[number].reshape(objects.shape)
+
+
 class NetworkSegmenter(PyTreeNode):
     """The `Segmenter` that segments a cloud of the image's points with the segmentation network.
 
@@ -157,8 +171,8 @@ class NetworkSegmenter(PyTreeNode):
       parameters: of the network.
       network: static.
       view: camera and shelf in its training, if its card records them; static.
-      capacity: the most segments; static. If the network tells fewer instances apart, what it leaves is segmented once
-        more.
+      capacity: the most segments; static. If the network tells fewer instances apart, it sees the left and the right
+        half of the surfaces one after the other.
     """
 
     parameters: Any
@@ -178,26 +192,27 @@ class NetworkSegmenter(PyTreeNode):
         objects = above_board(shelf, points) & ~of_target
         surface = surfaces(points, objects)
         objects &= ~hanging(shelf, points, objects, surface)
-        labels, count = self._segmented(key, shelf, points, objects, surface)
-        total = count
-        if self.capacity >= count:
-            left = objects & (labels == OTHER)
-            more, _ = self._segmented(jax.random.fold_in(key, 1), shelf, points, left, surface)
-            labels, total = jnp.where(left & (more >= 0), more + count, labels), 2 * count
+        segmented = functools.partial(self._segmented, shelf, points, surface)
+        if self.capacity < INSTANCES:
+            labels, count = segmented(key, objects), INSTANCES
+        else:
+            right, count = on_the_right(objects, surface), 2 * INSTANCES
+            sides = jnp.stack([objects & ~right, objects & right])
+            left_labels, labels = jax.lax.map(lambda side: segmented(*side), (jax.random.split(key), sides))
+            labels = jnp.where(right, jnp.where(labels >= 0, labels + INSTANCES, labels), left_labels)
         labels = jnp.where(of_target & (labels != MISSING), OTHER, labels)
-        return leave_out_smallest(labels, total, self.capacity)
+        return leave_out_smallest(labels, count, self.capacity)
 
     def _segmented(
-        self, key: Array, shelf: Shelf, points: Array, objects: Bool[Array, "h w"], surface: Int[Array, "h w"]
-    ) -> tuple[Int[Array, "h w"], int]:
-        """Labels of the pixels of objects, and the number of instances that the network tells apart."""
+        self, shelf: Shelf, points: Array, surface: Int[Array, "h w"], key: Array, objects: Bool[Array, "h w"]
+    ) -> Int[Array, "h w"]:
+        """Labels of the pixels of objects, whose `surface` is numbered."""
         from mechsearch_jax.networks.segmentation import apply_network
 
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface.reshape(-1))
         output = apply_network(self.network, self.parameters, self._as_trained(shelf, cloud.points)[None])
-        count = output.logits.shape[-1] - 1
-        labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid, count)
-        return spread_labels(points, objects, cloud.points, labels), count
+        labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
+        return spread_labels(points, objects, cloud.points, labels)
 
     def _as_trained(self, shelf: Shelf, points: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
         """The points shifted as if the shelf stood where it stood in training, the only place the network knows."""

@@ -1,0 +1,196 @@
+"""More objects than eight: a setting of the recogniser, of a workcell and of the configuration file, up to 16."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax.actions.kinds.nothing import no_action
+from mechsearch_jax.config.presets import standard
+from mechsearch_jax.envs.trials.native import near_path
+from mechsearch_jax.images.checks import Look
+from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.images.image_files import load_mask
+from mechsearch_jax.images.labels import FREE, OTHER
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.perception.segmentation import leave_out_smallest
+from mechsearch_jax.planner.trials import TrialResult, scenes_of
+from mechsearch_jax.problem.settings import load_settings
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session import preparing, warming
+from mechsearch_jax.session.faults import recognition_warnings
+from mechsearch_jax.session.searcher import Searcher
+from mechsearch_jax.workspace.camera import Camera, rays
+from mechsearch_jax.workspace.render import object_depth
+from mechsearch_jax.workspace.scenario import Body, superquadrics
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+# A table, and a camera as of a Kinect that looks down at it by 40 degrees from 1 m.
+TABLE = Shelf(front=0.4, back=1.0, right=-0.45, left=0.45, board=0.4, ceiling=0.85, faces=())
+DOWN = np.deg2rad(40.0)
+SIN, COS = float(np.sin(DOWN)), float(np.cos(DOWN))
+ROTATION = ((0.0, -SIN, COS), (-1.0, 0.0, 0.0), (0.0, -COS, -SIN))
+KINECT = Camera(640, 480, 525.0, 525.0, 320.0, 240.0, ROTATION, (0.7 - COS, 0.0, 0.43 + SIN))
+KEY = jax.random.key(0)
+# Twelve boxes, each with its place.
+BOXES = [
+    Body(
+        "box",
+        (0.02 + 0.003 * (i % 3), 0.03, 0.03 + 0.004 * (i % 4)),
+        (x, y, 0.43 + 0.004 * (i % 4)),
+        (1.0, 0.0, 0.0, 0.0),
+    )
+    for i, (x, y) in enumerate((x, y) for x in (0.52, 0.68, 0.84) for y in (-0.27, -0.09, 0.09, 0.27))
+]
+
+
+SETTING = types.SimpleNamespace(camera=KINECT, shelf=TABLE, target=Target.cylinder())
+
+
+def recogniser(capacity):
+    return Recogniser(SETTING, capacity=capacity)
+
+
+@pytest.fixture(scope="module")
+def look():
+    """Depth of the table with noise of 1 mm, and the box that each pixel shows."""
+    origin, directions = jnp.array(KINECT.position), rays(KINECT)
+    each = jax.jit(lambda s: jax.lax.map(lambda one: object_depth(one, origin, directions), s))
+    depths = np.asarray(each(superquadrics(BOXES, len(BOXES))))
+    board = warming.board_depth(KINECT, TABLE)
+    depth = np.minimum(depths.min(axis=0), board)
+    mask = np.where(depths.min(axis=0) < board, depths.argmin(axis=0), FREE)
+    return (depth + np.random.default_rng(0).normal(0.0, 1e-3, depth.shape)).astype(np.float32), mask.astype(np.int32)
+
+
+def found(objects):
+    """Of each box, which slots hold an object within 1 cm of its middle."""
+    apart = np.linalg.norm(np.asarray(objects.position)[None] - np.array([b.position for b in BOXES])[:, None], axis=-1)
+    return (apart < 0.01) & np.asarray(objects.valid)[None]
+
+
+def test_twelve_instances_of_a_mask_are_twelve_objects_in_its_order(look):
+    depth, mask = look
+    seen = recogniser(16)(KEY, depth, mask=mask, target_id=-1)
+    assert seen.objects.capacity == len(seen.confidence) == 16
+    np.testing.assert_array_equal(found(seen.objects), np.eye(12, 16, dtype=bool))
+    # The target's slot goes to the instance beyond the slots.
+    many = np.where(mask == 3, 16, mask)
+    seen = recogniser(16)(KEY, depth, mask=np.where(mask == 5, 0, np.where(mask == 0, 5, many)), target_id=0)
+    expected = np.eye(12, 16, dtype=bool)[[5, 1, 2, 0, 4, 3, *range(6, 12)]]
+    expected[5] = False
+    np.testing.assert_array_equal(found(seen.objects), expected)
+    with pytest.raises(InputError, match="objects are 0 to 8, all else -1, -2 or -3; for more things, set capacity"):
+        recogniser(8)(KEY, depth, mask=mask, target_id=-1)
+
+
+@pytest.mark.slow
+def test_with_more_slots_more_of_twelve_boxes_are_found(look):
+    depth, _ = look
+    few, many = (recogniser(capacity)(KEY, depth).objects for capacity in (8, 16))
+    assert found(few).any(axis=1).sum() <= 8
+    assert found(many).any(axis=1).sum() >= 11
+    assert int(many.valid.sum()) <= 13
+
+
+@pytest.mark.parametrize(("count", "capacity"), [(9, 8), (18, 16), (18, 12), (9, 3), (9, 9)])
+def test_the_largest_segments_stay_with_small_numbers(count, capacity):
+    rng = np.random.default_rng(count + capacity)
+    sizes = rng.permutation(np.arange(count)) * (rng.random(count) < 0.8)
+    labels = np.concatenate([np.repeat(np.arange(count), sizes), [FREE, OTHER]])[None].astype(np.int8)
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels), count, capacity))
+    largest = sorted(np.argsort(sizes, kind="stable")[-capacity:].tolist())
+    for number in range(count):
+        after = np.unique(kept[labels == number])
+        if sizes[number]:
+            assert len(after) == 1
+            assert (after[0] == OTHER) == (number not in largest)
+            assert after[0] in ((number,) if number < capacity and number in largest else (*range(capacity), OTHER))
+    assert kept[0, -2:].tolist() == [FREE, OTHER]
+    assert len(np.unique(kept[kept >= 0])) == sum(sizes[number] > 0 for number in largest)
+
+
+def test_the_file_and_the_workcell_say_how_many(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text("[objects]\ncapacity = 12\n")
+    assert load_settings(file).workcell == Workcell(capacity=12)
+    assert hash(Workcell(capacity=12)) != hash(Workcell())
+    for wrong in ("0", "17", "8.5"):
+        file.write_text(f"[objects]\ncapacity = {wrong}\n")
+        with pytest.raises(InputError, match=r"mine\.toml:2: \[objects\] capacity") as caught:
+            load_settings(file)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="Workcell: capacity: 17 must be a whole number of objects, 1 to 16"):
+        Workcell(capacity=17)
+    with pytest.raises(InputError, match="capacity: True must"):
+        recogniser(True)
+    np.save(tmp_path / "mask.npy", np.arange(12).reshape(3, 4))
+    assert len(load_mask(tmp_path / "mask.npy", 255, 11)[1]) == 12
+    with pytest.raises(InputError, match="names 12 objects; at most 11 can be told apart; for more things, set cap"):
+        load_mask(tmp_path / "mask.npy", 255, 10)
+
+
+def test_a_search_is_saved_with_its_slots(tmp_path, problem):
+    many, few = (Searcher(Workcell(capacity=n)) for n in (16, 8))
+    many.__dict__["problem"] = few.__dict__["problem"] = problem
+    many.save(tmp_path / "search.npz")
+    many.load(tmp_path / "search.npz")
+    assert many._now.observation.objects.capacity == 16
+    with pytest.raises(InputError, match="is missing or of another shape"):
+        few.load(tmp_path / "search.npz")
+
+
+def test_a_full_observation_says_how_to_hold_more(look):
+    depth, _ = look
+    bodies = superquadrics(BOXES[:8], 8)
+    seen = preparing.nothing_seen().replace(objects=bodies)
+    see = recogniser(8)
+    warnings = recognition_warnings(SETTING, Look(KINECT, TABLE, depth), seen, see)
+    assert any("all 8 slots are taken" in w and "set capacity, now 8, to up to 16" in w for w in warnings)
+
+
+def test_trials_have_room_for_what_is_nearest_to_the_gripper():
+    objects = jax.device_get(superquadrics(BOXES, 16))
+    T = np.eye(4, dtype=np.float32)
+    T[:3, :3], T[:3, 3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (0.6, -0.27, 0.45)
+    action = jax.device_get(no_action().replace(T_world_gripper=T, T_world_place=T, object=11))
+    kept = near_path(objects, action, 0.3)
+    assert len(kept) == 8
+    # The row that the hand goes along, the next one, and what it acts on.
+    assert {0, 1, 4, 5, 11} <= set(kept)
+    assert not {3, 7} & set(kept)
+    assert near_path(jax.tree.map(lambda a: a[:8], objects), action, 0.3) == tuple(range(8))
+
+
+@pytest.mark.slow
+def test_a_decision_with_sixteen_slots_is_made_and_tried():
+    images = example_images()
+    searcher = Searcher(Workcell(camera=images.camera, capacity=16), standard())
+    step = searcher.next(images.depth, images.colour)
+    usual = Searcher(Workcell(camera=images.camera), standard()).next(images.depth, images.colour)
+    assert step.observation.objects.capacity == 16
+    assert int(step.observation.objects.valid.sum()) >= int(usual.observation.objects.valid.sum())
+    assert step.kind in ("push", "pick-and-place")
+    assert len(step.to_json()["observation"]["objects"]) == int(step.observation.objects.valid.sum())
+    assert step.picture is not None
+    # Objects in other slots beside empty ones: trials come to the same.
+    trials = searcher._trials
+    seen = usual.observation
+    wide = seen.replace(objects=jax.tree.map(lambda a: jnp.concatenate([jnp.zeros_like(a), a]), seen.objects))
+    action = usual.decision.action
+    rows = lambda tree: jax.tree.map(lambda a: jnp.asarray(a)[None], tree)  # noqa: E731
+    results = [
+        trials(
+            searcher.problem,
+            rows(scenes_of(usual.belief, observation)),
+            rows(rows(dataclasses.replace(action, object=jnp.int32(number)))),
+            np.ones((1, 1), bool),
+        )[0, 0]
+        for observation, number in ((seen, int(action.object)), (wide, int(action.object) + 8))
+    ]
+    assert results[0] == results[1] != TrialResult.UNKNOWN
