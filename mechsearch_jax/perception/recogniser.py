@@ -365,8 +365,8 @@ def labelled(
         labels = _labels(instances, freed, shelf, points, core.capacity)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
         visible = (jnp.sum(of_target) > threshold).astype(bool)
-    of_target &= above_board(shelf, points) & visible
-    return LabelledImage(points, seen, labels, of_target, core.capacity), visible
+    image = LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible, core.capacity)
+    return image, visible
 
 
 def large_segments(labels: Int[Array, "h w"], pixels: float | Array, capacity: int = CAPACITY) -> Int[Array, "h w"]:
