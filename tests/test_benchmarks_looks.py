@@ -14,10 +14,10 @@ from mechsearch_jax.envs.world.mismatch import USUAL_COLOUR_NOISE, USUAL_HUE_GAP
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import thinned_view
 from mechsearch_jax.images.colour import RED
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.perception.confidence import Measures
 from mechsearch_jax.perception.doubt import Thing
 from mechsearch_jax.perception.explanation import Fitted
-from mechsearch_jax.perception.hypotheses import SLOTS
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, example_scenarios, load_scenario, superquadrics
@@ -116,10 +116,10 @@ def test_an_object_that_stands_for_a_found_target_is_a_phantom(scene):
     scenario, picture = scene
     view = thinned_view(WORKCELL.camera, WORKCELL.shelf)
     labels = np.asarray(view.of(jnp.asarray(picture.owner)))
-    truth = superquadrics([scenario.target], SLOTS)
-    zeros = np.zeros(SLOTS)
+    truth = superquadrics([scenario.target], CAPACITY)
+    zeros = np.zeros(CAPACITY)
     measures = Measures(truth.valid, zeros, zeros, zeros, zeros)
-    fitted = Fitted(truth, np.zeros(3), np.full(SLOTS, 0.9), measures, labels, np.zeros(SLOTS, bool))
+    fitted = Fitted(truth, np.zeros(3), np.full(CAPACITY, 0.9), measures, labels, np.zeros(CAPACITY, bool))
     kind = "explained", "clean"
     counts = [len(looks.judged(scenario, picture, kind, fitted, visible, view.of)[1]) for visible in (False, True)]
     assert counts == [0, 1]

@@ -82,7 +82,7 @@ def test_the_number_of_scenes_is_whole():
 def test_a_scene_is_made_once_by_whichever_thread_comes_first():
     made, begin = [], threading.Barrier(4)
 
-    def make(number):
+    def make(number, kept):
         made.append(number)
         time.sleep(0.02)
         return None if number == 1 else f"scene {number}"
@@ -91,7 +91,7 @@ def test_a_scene_is_made_once_by_whichever_thread_comes_first():
 
     def take(_):
         begin.wait()
-        return [near[n] for n in range(3)]
+        return [near[n, (0, 2)] for n in range(3)]
 
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(take, range(4))) == [["scene 0", None, "scene 2"]] * 4

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.images.cloud import above_board, thinned_view
-from mechsearch_jax.images.labels import FREE, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, OTHER
 from mechsearch_jax.perception.confidence import Measures, confidence_of
 from mechsearch_jax.perception.explanation import Explaining, ExplanationConfig
-from mechsearch_jax.perception.hypotheses import SLOTS, WAYS, distinct
+from mechsearch_jax.perception.hypotheses import WAYS, distinct
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import Costs, moves_of, sample_of, select_objects
@@ -68,7 +68,7 @@ def explained():
         labels = np.where(owner >= 0, np.array(segments)[np.maximum(owner, 0)], owner).astype(np.int8)
         of_target = owner == len(BODIES)
         left = of_target & (np.asarray(points)[..., 1] > TARGET_BODY.position[1] + 0.005)
-        labels[of_target & ~left] = SLOTS
+        labels[of_target & ~left] = CAPACITY
         image = LabelledImage(
             points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.asarray(of_target & ~left)
         )
@@ -112,11 +112,11 @@ def test_no_object_stands_in_a_found_target(explained):
     """A part of it has a segment, and its own pixels have a label beyond the slots."""
     labels, seen = explained(0, 1, 2, 3)
     assert (labels == 3).sum() > 20
-    assert (labels == SLOTS).sum() > 50
+    assert (labels == CAPACITY).sum() > 50
     errors, count = recognised(seen.objects)
     assert errors.max() < 0.01
     assert count == 3
-    assert not np.isin(np.asarray(seen.labels)[labels >= 3], range(SLOTS)).any()
+    assert not np.isin(np.asarray(seen.labels)[labels >= 3], range(CAPACITY)).any()
     np.testing.assert_allclose(seen.target_pose[:2], TARGET_BODY.position[:2], atol=0.01)
 
 
@@ -126,10 +126,10 @@ BOX = (0.03, 0.03, 0.05)
 @functools.partial(jax.jit, static_argnames="costs")
 def chosen_of(scene, image, united, pixels, costs):
     """The selection among segments, what the first is split into, and the union of the first two if there is one."""
-    base = jax.tree.map(lambda a: a[:SLOTS], scene)
+    base = jax.tree.map(lambda a: a[:CAPACITY], scene)
     sample = sample_of(jax.random.key(0), image, base, VIEW.camera, SHELF, costs)
     pair = jnp.zeros(1, int), jnp.ones(1, int)
-    moves = moves_of(jnp.zeros(1, int), jnp.zeros(WAYS, bool), pair, united)
+    moves = moves_of(CAPACITY, jnp.zeros(1, int), jnp.zeros(WAYS, bool), pair, united)
     return select_objects(scene, moves, sample, pixels, costs)
 
 
@@ -137,10 +137,10 @@ def selection(bodies, shown, unions=(), target=None, costs=None, segmented=None)
     """What is selected of bodies for the first segments and for the first unions, in an image of the bodies `shown`, of
     which the first `segmented`, all if None, have segments."""
     count = 2 * WAYS
-    scene = superquadrics([*bodies], SLOTS + count + 2)
+    scene = superquadrics([*bodies], CAPACITY + count + 2)
     absent = np.arange(scene.capacity) >= len(bodies)
     scene = scene.replace(valid=jnp.asarray(~absent))
-    for i, body in [*enumerate(unions, SLOTS + count), *([(scene.capacity - 1, target)] if target else [])]:
+    for i, body in [*enumerate(unions, CAPACITY + count), *([(scene.capacity - 1, target)] if target else [])]:
         alone = superquadrics([body])
         scene = jax.tree.map(lambda a, b, i=i: a.at[i].set(b[0]), scene, alone)
     camera, directions = VIEW.camera, rays(VIEW.camera)
@@ -155,7 +155,7 @@ def selection(bodies, shown, unions=(), target=None, costs=None, segmented=None)
     owner = np.where(owner < (len(shown) if segmented is None else segmented), owner, OTHER)
     labels = np.where(shows, owner, FREE).astype(np.int8)
     image = LabelledImage(points, jnp.asarray(depth, jnp.float32), jnp.asarray(labels), jnp.zeros(depth.shape, bool))
-    pixels = jnp.zeros(SLOTS, int).at[0].set(int(shows.sum()))
+    pixels = jnp.zeros(CAPACITY, int).at[0].set(int(shows.sum()))
     chosen = chosen_of(scene, image, jnp.full(1, bool(unions)), pixels, costs or Costs())
     return np.flatnonzero(chosen.selected).tolist(), np.asarray(chosen.margin)
 
@@ -170,7 +170,7 @@ def test_a_phantom_in_an_object_is_dropped():
 
 
 def test_the_target_is_priced_like_an_object():
-    shown, target, last = [box(0.0, 0.0, BOX)], box(0.035, 0.0, BOX), SLOTS + 2 * WAYS + 1
+    shown, target, last = [box(0.0, 0.0, BOX)], box(0.035, 0.0, BOX), CAPACITY + 2 * WAYS + 1
     cheap, dear = (selection(shown, shown, target=target, costs=Costs(overlap_cost=cost)) for cost in (20.0, 40.0))
     assert cheap[0] == dear[0] == [0, last]
     # It is 2.5 cm in the target, of which 1 cm is recognition's own error.
@@ -180,7 +180,7 @@ def test_the_target_is_priced_like_an_object():
 def test_two_objects_in_one_another_become_one():
     whole = box(0.0, 0.0, (0.03, 0.08, 0.05))
     parts = [box(0.0, -0.03, (0.03, 0.05, 0.05)), box(0.0, 0.03, (0.03, 0.05, 0.05))]
-    assert selection(parts, [whole], unions=[whole])[0] == [SLOTS + 2 * WAYS]
+    assert selection(parts, [whole], unions=[whole])[0] == [CAPACITY + 2 * WAYS]
 
 
 def test_pixels_of_no_segment_speak_for_no_object():

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import above_board, thinned_view
-from mechsearch_jax.images.labels import FREE
+from mechsearch_jax.images.labels import CAPACITY, FREE
 from mechsearch_jax.perception.explanation import as_segmented
-from mechsearch_jax.perception.hypotheses import SLOTS, standing
+from mechsearch_jax.perception.hypotheses import standing
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.rough_shapes import SHAPES, rough_shapes
@@ -115,10 +115,10 @@ def sample(points, label):
 
 def test_what_lies_over_another_stands_on_it_and_what_is_behind_does_not():
     """The lower body is slot 0; another stands on it, and a third behind it shows its upper half only."""
-    sizes = jnp.asarray([(0.08, 0.08, 0.03)] + [(0.02,) * 3] * (SLOTS - 1))
-    places = jnp.asarray([(0.6, 0.0, 0.43)] + [(0.6, 9.0, 0.5)] * (SLOTS - 1))
-    edges = jnp.full((SLOTS, 2), 0.03)
-    base = Superquadrics(sizes, edges, places, jnp.broadcast_to(jnp.eye(3), (SLOTS, 3, 3)), jnp.arange(SLOTS) < 3)
+    sizes = jnp.asarray([(0.08, 0.08, 0.03)] + [(0.02,) * 3] * (CAPACITY - 1))
+    places = jnp.asarray([(0.6, 0.0, 0.43)] + [(0.6, 9.0, 0.5)] * (CAPACITY - 1))
+    edges = jnp.full((CAPACITY, 2), 0.03)
+    base = Superquadrics(sizes, edges, places, jnp.broadcast_to(jnp.eye(3), (CAPACITY, 3, 3)), jnp.arange(CAPACITY) < 3)
     rng = np.random.default_rng(3)
     lower = np.concatenate([rng.uniform((0.52, -0.08, 0.4), (0.52, 0.08, 0.46), (60, 3))] * 2)
     lower[60:, 0], lower[60:, 2] = rng.uniform(0.52, 0.68, 60), 0.46
@@ -132,7 +132,7 @@ def test_what_lies_over_another_stands_on_it_and_what_is_behind_does_not():
     R, shift = Rotation.from_euler("z", 0.7).as_matrix(), np.array([0.1, -0.2, 0.05])
     turned = base.replace(
         position=jnp.asarray(np.asarray(places) @ R.T + shift, jnp.float32),
-        rotation=jnp.broadcast_to(jnp.asarray(R, jnp.float32), (SLOTS, 3, 3)),
+        rotation=jnp.broadcast_to(jnp.asarray(R, jnp.float32), (CAPACITY, 3, 3)),
     )
     moved = jax.jit(standing)(masks, turned, sample(points @ R.T + shift, label), jnp.float32(0.45))
     np.testing.assert_allclose(moved, np.asarray(heights) + 0.05, atol=0.002)
@@ -157,7 +157,7 @@ def test_a_box_on_a_box_is_recognised_where_it_stands():
     lower = Body("box", (0.07, 0.1, 0.03), (*MIDDLE, SHELF.board + 0.03), (1.0, 0.0, 0.0, 0.0))
     upper = Body("box", (0.03, 0.05, 0.05), (*MIDDLE, SHELF.board + 0.11), (0.98, 0.0, 0.0, 0.2))
     seen, truth = recognised([lower, upper])
-    assert np.asarray(seen.objects.valid).tolist() == [True, True] + [False] * (SLOTS - 2)
+    assert np.asarray(seen.objects.valid).tolist() == [True, True] + [False] * (CAPACITY - 2)
     # The upper one hides how deep the lower one is.
     np.testing.assert_allclose(seen.objects.position[:2], truth.position[:2], atol=0.02)
     np.testing.assert_allclose(seen.objects.position[1], truth.position[1], atol=0.006)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks import segmentation as networks
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, leave_out_smallest
@@ -24,16 +24,16 @@ def stripes(sizes):
 
 def test_of_nine_segments_the_smallest_is_left_out_and_the_last_takes_its_number():
     labels = stripes(SIZES)
-    kept = np.asarray(leave_out_smallest(jnp.asarray(labels)))
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels), 9, CAPACITY))
     np.testing.assert_array_equal(kept, np.where(labels == 2, OTHER, np.where(labels == 8, 2, labels)))
     last = stripes([*SIZES[:8], 1])
-    kept = np.asarray(leave_out_smallest(jnp.asarray(last)))
+    kept = np.asarray(leave_out_smallest(jnp.asarray(last), 9, CAPACITY))
     np.testing.assert_array_equal(kept, np.where(last == 8, OTHER, last))
 
 
 def test_of_fewer_segments_none_is_left_out():
     labels = stripes([*SIZES[:4], 0, *SIZES[5:]])
-    kept = np.asarray(leave_out_smallest(jnp.asarray(labels)))
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels), 9, CAPACITY))
     np.testing.assert_array_equal(kept, np.where(labels == 8, 4, labels))
 
 

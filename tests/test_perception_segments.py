@@ -12,8 +12,7 @@ from mechsearch_jax.envs.camera import recognisers
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.scenes.scene_sets import find_scene, make_scene
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.images.labels import FREE, MISSING, OTHER
-from mechsearch_jax.perception.hypotheses import SLOTS
+from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER
 from mechsearch_jax.perception.parts.segments import Connected, SegmentsConfig, connected_segments
 from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.runtime.errors import InputError
@@ -42,7 +41,7 @@ def things(rectangles, config=CONFIG, least=0.0):
     points, labels = image(rectangles)
     after = np.asarray(connected_segments(points, labels, config, least))
     assert after.dtype == labels.dtype
-    return [after == number for number in range(SLOTS) if (after == number).any()], after
+    return [after == number for number in range(CAPACITY) if (after == number).any()], after
 
 
 def test_one_segment_of_two_things_is_cut():
@@ -69,7 +68,7 @@ def test_the_largest_are_kept_and_crumbs_are_no_things():
     # Ten plates that nothing connects, the first ones largest.
     plates = [((4 * i, 4 * i + 3), (0, 50 - 3 * i), 0.8, i % 9) for i in range(10)]
     segments, after = things(plates)
-    assert [int(each.sum()) for each in segments] == [3 * (50 - 3 * i) for i in range(SLOTS)]
+    assert [int(each.sum()) for each in segments] == [3 * (50 - 3 * i) for i in range(CAPACITY)]
     assert all((after[4 * i : 4 * i + 3, : 50 - 3 * i] == OTHER).all() for i in (8, 9))
     small = ((0, 2), (0, 5), 0.8, 4)
     assert not things([small])[0]
@@ -103,7 +102,7 @@ def test_pieces_are_those_of_a_reference_and_compiled_and_batched_agree(seed):
     for label in range(4):
         pieces, count = ndimage.label(labels == label)
         reference += [pieces == number for number in range(1, count + 1)]
-    kept = sorted((int(piece.sum()) for piece in reference), reverse=True)[:SLOTS]
+    kept = sorted((int(piece.sum()) for piece in reference), reverse=True)[:CAPACITY]
     assert [int((after == number).sum()) for number in range(len(kept))] == kept
     for piece in reference:
         assert len(np.unique(after[piece])) == 1

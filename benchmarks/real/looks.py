@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ from mechsearch_jax.benchmarks.real.scenes import LabelledScene
 from mechsearch_jax.benchmarks.real.scores import Body, Thing, scored
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.images.labels import INSTANCES
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig, recognition_doubt
 from mechsearch_jax.perception.recogniser import Recogniser, Setting
@@ -50,9 +51,9 @@ class Cell(NamedTuple):
 Maker = Callable[[Setting], Callable[..., Observation]]
 
 
-def recogniser(cell: Setting) -> Recogniser:
+def recogniser(cell: Setting, capacity: int = CAPACITY) -> Recogniser:
     """The package's recogniser, of a target that is nowhere."""
-    return Recogniser(cell, detector=TargetColour.lit(ABSENT))
+    return Recogniser(cell, detector=TargetColour.lit(ABSENT), capacity=capacity)
 
 
 def program() -> str:
@@ -64,7 +65,8 @@ def looks_at(
     scenes: Mapping[str, Callable[[], LabelledScene | None]],
     shelf: Shelf | None = None,
     out: Path | None = None,
-    make: Maker = recogniser,
+    make: Maker | None = None,
+    capacity: int = CAPACITY,
 ) -> Iterator[list[Look]]:
     """The looks at each scene, one from depth and colour and one with the true masks; none if it has no labels.
 
@@ -72,19 +74,21 @@ def looks_at(
       scenes: as `find_scenes` returns them.
       shelf: of all of them; by default the table before the camera.
       out: folder for what is known of each scene, which is not looked at again by the same program, and for pictures.
-      make: makes recognisers.
+      make: makes recognisers; by default `recogniser`, of the capacity.
+      capacity: how many objects they can hold.
 
     Raises:
       InputError: a file is wrong, or cannot be read or written.
     """
-    version, path = f"{program()} {shelf}", None if out is None else out / ROWS
+    make = make or functools.partial(recogniser, capacity=capacity)
+    version, path = f"{program()} {shelf} {capacity}", None if out is None else out / ROWS
     kept = {} if path is None or not path.exists() else _kept(path, version)
     for name, read in scenes.items():
         if name in kept:
             yield kept[name]
             continue
         scene = read()
-        looks = [] if scene is None else list(_looks(name, scene, shelf, make, out))
+        looks = [] if scene is None else list(_looks(name, scene, shelf, make, capacity, out))
         if path is not None:
             row = {"program": version, "scene": name, "looks": list(map(dataclasses.asdict, looks))}
             with open(path, "a", encoding="utf-8") as file:
@@ -108,12 +112,14 @@ def _look(row: dict[str, Any]) -> Look:
     return Look(**{**row, **parts})
 
 
-def _looks(name: str, scene: LabelledScene, shelf: Shelf | None, make: Maker, out: Path | None) -> Iterator[Look]:
+def _looks(
+    name: str, scene: LabelledScene, shelf: Shelf | None, make: Maker, capacity: int, out: Path | None
+) -> Iterator[Look]:
     cell = Cell(*scene.workspace(shelf), Target.cylinder())
     recognise = make(cell)
     numbers, pixels = np.unique(scene.mask[scene.mask >= 0], return_counts=True)
     # Of more things than slots the smallest are left out.
-    slots = {number: i for i, number in enumerate(numbers[np.argsort(-pixels)][: INSTANCES - 1].tolist())}
+    slots = {number: i for i, number in enumerate(numbers[np.argsort(-pixels)][:capacity].tolist())}
     mask = np.full(scene.mask.shape, -1, np.int32)
     for number, slot in slots.items():
         mask[scene.mask == number] = slot

@@ -4,7 +4,8 @@ The recognised objects become bodies as in `physics_push`, those of several part
 of its own shape; they come to rest, and the arm moves as in the environment. The environment's own simulator is not
 involved.
 
-An approximation: what is not recognised, including a hidden target, is absent from the trials.
+Approximations: what is not recognised, including a hidden target, is absent from the trials; and of more than eight
+objects all but the eight nearest to the path of the gripper.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -47,8 +48,10 @@ from mechsearch_jax.session.preparing import Program, motions, program
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Scenes near that of a row; None for one that MuJoCo cannot build.
-_Near = PerturbedScenes[TrialScene | None]
+# Worlds near that of a row, and their scenes; None for one that MuJoCo cannot build.
+_Near = PerturbedScenes[tuple[World, TrialScene | None]]
+# Places along each straight part of a gripper's path.
+_PLACES = 5
 
 
 class TrialSetup(NamedTuple):
@@ -90,45 +93,37 @@ class NativeTrials:
     def __call__(
         self, problem: Problem, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
     ) -> Int[np.ndarray, "r k"]:
-        """See `trials.Trials`.
-
-        Raises:
-          InputError: the simulator has too few slots for the objects.
-        """
+        """See `trials.Trials`."""
         return self.in_cell(TrialSetup(problem.target, problem.shelf, problem.gripper), scenes, actions, wanted)
 
     def in_cell(
         self, cell: TrialSetup, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
     ) -> Int[np.ndarray, "r k"]:
         """`__call__` without a problem."""
-        if scenes.objects.valid.shape[-1] > TARGET:
-            raise InputError(f"the simulator has slots for {TARGET} objects, not for {scenes.objects.valid.shape[-1]}")
         config = self._motion_config(cell)
         simulation = dataclasses.replace(self.simulation, motion=config)
         actions, scenes = jax.device_get((actions, scenes))
 
-        def make(row: int) -> tuple[World, _Near]:
-            world, scene = self._scene(cell, simulation, scenes, row)
+        def make(row: int) -> _Near:
+            return PerturbedScenes(
+                lambda number, kept: self._scene(cell, simulation, self.nearby.drawn(scenes, number), row, kept)
+            )
 
-            def near(number: int) -> TrialScene | None:
-                return self._scene(cell, simulation, self.nearby.drawn(scenes, number), row)[1] if number else scene
-
-            return world, PerturbedScenes(near)
-
-        def attempt(made: tuple[World, _Near], row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
-            world, near = made
+        def attempt(near: _Near, row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
             action: Action = jax.tree.map(lambda a: np.asarray(a[row, i]), actions)
+            kept = near_path(jax.tree.map(lambda a: a[row], scenes.objects), action, cell.gripper.approach)
             kind = kind_of(int(action.kind))
             motion = jax.device_get(reference_motion(kind, action, config))
             if motion is None or not motion[1]:
                 return TrialResult.FAILED
-            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
+            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (near[0, kept][0], motion[0]))):
                 return TrialResult.UNKNOWN
+            index = kept.index(int(action.object)) if int(action.object) in kept else TARGET
             result = TrialResult.UNKNOWN
             for number in range(1 + self.nearby.scenes * kind.takes_target):
                 if not needed():
                     return None
-                result = _attempted(near[number], kind, motion[0], int(action.object), needed)
+                result = _attempted(near[number, kept][1], kind, motion[0], index, needed)
                 if result is not TrialResult.SUCCEEDED:
                     return TrialResult.UNSURE if number and result is TrialResult.FAILED else result
             return result
@@ -157,31 +152,34 @@ class NativeTrials:
         """`ends` without a problem."""
         simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
         actions, scenes = jax.device_get((actions, scenes))
-        count = scenes.objects.valid.shape[-1]
 
         def end(row: int) -> Float[np.ndarray, "2 n 3"]:
-            nowhere = np.full((2, count, 3), np.nan, np.float32)
+            # What is left out stays.
+            places = np.stack([np.asarray(scenes.objects.position[row])] * 2)
+            nowhere = np.full_like(places, np.nan)
             action: Action = jax.tree.map(lambda a: np.asarray(a[row]), actions)
+            kept = near_path(jax.tree.map(lambda a: a[row], scenes.objects), action, cell.gripper.approach)
             kind = kind_of(int(action.kind))
             motion = jax.device_get(reference_motion(kind, action, simulation.motion))
-            world, scene = self._scene(cell, simulation, scenes, row)
+            world, scene = self._scene(cell, simulation, scenes, row, kept)
             if motion is None or not motion[1] or scene is None:
                 return nowhere
             if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
                 return nowhere
             try:
-                return scene.ends(kind, motion[0], arm_stop)[:, :count].astype(np.float32)
+                places[:, kept] = scene.ends(kind, motion[0], arm_stop)[:, : len(kept)]
             except mujoco.FatalError:
                 return nowhere
+            return places
 
         with ThreadPoolExecutor(self.threads or cores()) as pool:
             return np.stack(list(pool.map(end, range(len(scenes.found)))))
 
     def _scene(
-        self, cell: TrialSetup, simulation: SimulatorConfig, scenes: TrialScenes, row: int
+        self, cell: TrialSetup, simulation: SimulatorConfig, scenes: TrialScenes, row: int, kept: tuple[int, ...]
     ) -> tuple[World, TrialScene | None]:
-        """The world of a row, and the scene in which it is at rest; None if it cannot be built."""
-        objects = jax.tree.map(lambda a: a[row], scenes.objects)
+        """The world of a row with the kept objects, and its scene at rest; None if it cannot be built."""
+        objects = jax.tree.map(lambda a: a[row, list(kept)], scenes.objects)
         world = jax.device_get(trial_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
         friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
         return world, scene_at_rest(cell, simulation, world, objects, friction, mass)
@@ -200,6 +198,28 @@ class NativeTrials:
 
     def _motion_config(self, cell: TrialSetup) -> MotionConfig:
         return dataclasses.replace(self.simulation.motion, gripper=cell.gripper)
+
+
+def near_path(objects: Superquadrics, action: Action, approach: float) -> tuple[int, ...]:
+    """The slots of the objects that a trial has room for: all, or those that are nearest to the path of the gripper.
+
+    Args:
+      objects: of a scene, as NumPy arrays.
+      action: that is tried.
+      approach: length of the gripper's straight approach [m].
+    """
+    if len(objects.valid) <= TARGET:
+        return tuple(range(len(objects.valid)))
+    begin, end = action.T_world_gripper, action.T_world_place
+    share = np.linspace(0.0, 1.0, _PLACES)[:, None]
+    before = begin[:2, 3] - approach * share * begin[:2, 2]
+    way = np.concatenate([before, begin[:2, 3] + share * (end - begin)[:2, 3]])
+    apart = np.linalg.norm(objects.position[:, None, :2] - way[None], axis=-1).min(axis=1)
+    apart -= np.linalg.norm(objects.size[:, :2], axis=-1)
+    # What is acted on, unless it is the target.
+    apart[int(action.object) : int(action.object) + 1] = -np.inf
+    nearest = np.argsort(np.where(objects.valid, apart, np.inf), kind="stable")[:TARGET]
+    return tuple(sorted(nearest.tolist()))
 
 
 def _attempted(

@@ -82,18 +82,18 @@ class Perturbations:
 
 
 class PerturbedScenes(Generic[Scene]):
-    """A scene, by the number 0, and those near it, each made when first needed, by one thread.
+    """A scene, by the number 0, and those near it, with some of its objects; each is made when first needed, once.
 
     Args:
-      make: makes the scene of a number.
+      make: makes the scene of a number with the objects of some slots.
     """
 
-    def __init__(self, make: Callable[[int], Scene]) -> None:
+    def __init__(self, make: Callable[[int, tuple[int, ...]], Scene]) -> None:
         self._make, self._lock = make, threading.Lock()
-        self._made: dict[int, Scene] = {}
+        self._made: dict[tuple[int, tuple[int, ...]], Scene] = {}
 
-    def __getitem__(self, number: int) -> Scene:
+    def __getitem__(self, key: tuple[int, tuple[int, ...]]) -> Scene:
         with self._lock:
-            if number not in self._made:
-                self._made[number] = self._make(number)
-            return self._made[number]
+            if key not in self._made:
+                self._made[key] = self._make(*key)
+            return self._made[key]

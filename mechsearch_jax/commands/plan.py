@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
@@ -79,25 +80,28 @@ class ImageFiles:
         if self.topics and self.bag is None:
             raise InputError("plan: --topics are those of --bag; give it, too")
 
-    def load(self, config: Path | None, camera: Camera) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
+    def load(
+        self, config: Path | None, camera: Camera, capacity: int = CAPACITY
+    ) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
         """The arguments of `Searcher.next`, their camera, and warnings about them.
 
         Args:
           config: the configuration file, if there is one.
           camera: its camera, or the default one.
+          capacity: how many objects recognition can hold.
 
         Raises:
           InputError: a file cannot be used.
         """
         if self.depth:
-            return self._from_files(camera)
+            return self._from_files(camera, capacity)
         if self.bop is not None:
             from mechsearch_jax.commands.options import base_of
             from mechsearch_jax.images.bop import bop_image
 
             x, y, z = base_of(config)
             posed = None if config is None else camera.moved((x, y, z))
-            images = bop_image(self.bop, self.image, camera=posed, target=self.target_id)
+            images = bop_image(self.bop, self.image, camera=posed, target=self.target_id, capacity=capacity)
             images = dataclasses.replace(images, camera=images.camera.moved((-x, -y, -z)))
         else:
             from mechsearch_jax.images.bags import bag_images
@@ -111,9 +115,8 @@ class ImageFiles:
         arguments = {name: value for name in names if (value := getattr(images, name)) is not None}
         return arguments, images.camera, ()
 
-    def _from_files(self, camera: Camera) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
+    def _from_files(self, camera: Camera, capacity: int) -> tuple[dict[str, Any], Camera, tuple[str, ...]]:
         from mechsearch_jax.images import image_files
-        from mechsearch_jax.images.labels import INSTANCES
         from mechsearch_jax.images.lens import Lens
         from mechsearch_jax.images.measured import median_depth
 
@@ -124,7 +127,7 @@ class ImageFiles:
         if self.colour is not None:
             images["colour"] = lens.colour(image_files.load_colour(self.colour))
         if self.mask is not None:
-            mask, numbers = image_files.load_mask(self.mask, self.background)
+            mask, numbers = image_files.load_mask(self.mask, self.background, capacity)
             images["mask"] = lens.mask(mask)
             if self.target_id is not None:
                 # A number that the mask does not show: the target is not seen.
@@ -135,10 +138,10 @@ class ImageFiles:
                         "not seen; give the number that the mask has for it, or a negative one where it does not show "
                         "it",
                     )
-            elif self.colour is None and len(numbers) == INSTANCES:
+            elif self.colour is None and len(numbers) > capacity:
                 raise InputError(
-                    f"{self.mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one "
-                    "out"
+                    f"{self.mask}: names {len(numbers)} objects; say with --target-id which is the target, or leave "
+                    "one out"
                 )
         return images, lens.camera, warnings
 
@@ -179,7 +182,7 @@ def plan(
     if images.example:
         (arguments, camera), warnings = _example(out), ()
     else:
-        arguments, camera, warnings = images.load(config, settings.workcell.camera)
+        arguments, camera, warnings = images.load(config, settings.workcell.camera, settings.workcell.capacity)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:

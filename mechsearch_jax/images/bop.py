@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int
 
 from mechsearch_jax.images.examples import Images
 from mechsearch_jax.images.image_files import MILLIMETRE, camera_of, load_colour, load_depth, load_pixels, number_array
-from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.labels import CAPACITY, OTHER
 from mechsearch_jax.runtime.errors import InputError, Note, shown
 from mechsearch_jax.runtime.files import PathLike, read_json
 from mechsearch_jax.workspace.camera import Camera
@@ -24,14 +24,21 @@ from mechsearch_jax.workspace.camera import Camera
 SCENE = "scene_camera.json"
 
 
-def bop_images(folder: PathLike, *, camera: Camera | None = None, target: int | None = None) -> Iterator[Images]:
+def bop_images(
+    folder: PathLike, *, camera: Camera | None = None, target: int | None = None, capacity: int = CAPACITY
+) -> Iterator[Images]:
     """The images of a BOP scene one after the other, each read when it is asked for: `bop_image` of every number."""
     for number in entries(Path(folder)):
-        yield bop_image(folder, number, camera=camera, target=target)
+        yield bop_image(folder, number, camera=camera, target=target, capacity=capacity)
 
 
 def bop_image(
-    folder: PathLike, number: int | None = None, *, camera: Camera | None = None, target: int | None = None
+    folder: PathLike,
+    number: int | None = None,
+    *,
+    camera: Camera | None = None,
+    target: int | None = None,
+    capacity: int = CAPACITY,
 ) -> Images:
     """The images with one number of a BOP scene; `colour` or `mask` is None where the scene has none.
 
@@ -44,6 +51,7 @@ def bop_image(
       camera: its pose is taken where the scene has none. Otherwise the frame of the scene is that of the robot's base.
       target: the target's number in the names of the mask's files, as in `scene_gt.json`; negative where it is known
         not to show. The images' `target_id` is its number in the mask, -1 where it does not show.
+      capacity: how many objects the recogniser can hold, beside the target.
 
     Raises:
       InputError: a file is missing or cannot be used, or nothing says where the camera is.
@@ -62,7 +70,7 @@ def bop_image(
     depth = load_depth(_file(scene, "depth", number)) * np.float32(scale)
     coloured = any(scene.glob("rgb/*"))
     colour = load_colour(_file(scene, "rgb", number)) if coloured else None
-    mask, numbers = _mask(scene, number, depth.shape, INSTANCES - (not coloured and target is None), target)
+    mask, numbers = _mask(scene, number, depth.shape, capacity + (coloured or target is not None), target)
     return Images(
         depth,
         colour,

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.images.cloud import BLOCK, View, above_board, density, shelf_view, thinned_view
 from mechsearch_jax.images.detection import coloured_pixels
-from mechsearch_jax.images.labels import INSTANCES, MISSING
+from mechsearch_jax.images.labels import CAPACITY, MISSING, more_room
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, measured
@@ -33,12 +33,20 @@ SMALL = 0.025
 RIM = 0.01
 
 
-def check_images(camera: Camera, depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None) -> None:
+def check_images(
+    camera: Camera,
+    depth: Any,
+    colour: Any = None,
+    mask: Any = None,
+    target_id: Any = None,
+    capacity: int = CAPACITY,
+) -> None:
     """Check that images can be used: all that can be said of them without their shelf.
 
     Args:
       camera: of the images.
-      depth, colour, mask, target_id: as of a `Recogniser`.
+      depth, colour, mask, target_id: as of a `Recogniser` ...
+      capacity: ... that holds so many objects.
 
     Raises:
       InputError: one of them has the wrong shape, type or unit. Values are checked outside `jit` only.
@@ -63,7 +71,7 @@ def check_images(camera: Camera, depth: Any, colour: Any = None, mask: Any = Non
         if not jnp.issubdtype(jnp.result_type(target_id), jnp.integer) or jnp.ndim(target_id) != 0:
             raise InputError(f"target_id: {target_id} must be one whole number, that of the target in the mask")
     if mask is not None:
-        _check_mask(mask, colour is None and target_id is None)
+        _check_mask(mask, colour is None and target_id is None, capacity)
 
 
 def _values(image: Any) -> np.ndarray | None:
@@ -94,19 +102,25 @@ def _check_colour(colour: Any) -> None:
         raise InputError("colour image: its floats must be from 0 to 1; divide 8-bit values by 255")
 
 
-def _check_mask(mask: Any, blind: bool) -> None:
+def _check_mask(mask: Any, blind: bool, capacity: int) -> None:
     if not jnp.issubdtype(mask.dtype, jnp.integer):
-        raise InputError(f"mask image: holds {mask.dtype}; give whole numbers, 0 to 8 for objects, -1 for none")
+        raise InputError(
+            f"mask image: holds {mask.dtype}; give whole numbers, 0 to {capacity} for objects, -1 for none"
+        )
     values = _values(mask)
     if values is None:
         return
     low, high = (int(v) for v in (np.asarray(mask).min(), np.asarray(mask).max()))
-    if low < MISSING or high >= INSTANCES:
+    if low < MISSING or high > capacity:
         raise InputError(
-            f"mask image: holds numbers from {low} to {high}; objects are 0 to {INSTANCES - 1}, all else -1, -2 or -3"
+            f"mask image: holds numbers from {low} to {high}; objects are 0 to {capacity}, all else -1, -2 or -3"
+            f"{more_room(capacity)}"
         )
-    if blind and high == INSTANCES - 1:
-        raise InputError(f"mask image: nine things are too many; say with target_id which of 0 to {high} is the target")
+    if blind and high == capacity:
+        raise InputError(
+            f"mask image: {high + 1} things are too many; say with target_id which of 0 to {high} is the target"
+            f"{more_room(capacity)}"
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

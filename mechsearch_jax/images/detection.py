@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.images.cloud import MARGIN, above_board, draw
-from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.labels import CAPACITY, OTHER
 from mechsearch_jax.images.target_pose import (
     Evidence,
     Placement,
@@ -202,7 +202,7 @@ def near_target(
 
 
 def without_phantoms(
-    labels: Int[Array, "h w"], on_it: Bool[Array, "h w"], of_target: Bool[Array, "h w"]
+    labels: Int[Array, "h w"], on_it: Bool[Array, "h w"], of_target: Bool[Array, "h w"], capacity: int = CAPACITY
 ) -> Int[Array, "h w"]:
     """Labels in which a segment that lies mostly on the fitted target is OTHER, for its points are the target's.
 
@@ -213,8 +213,9 @@ def without_phantoms(
       labels: as in `images.labels`.
       on_it: pixels on the fitted target; none if it is not visible.
       of_target: the target's pixels.
+      capacity: segments are numbered up to it.
     """
-    member = labels[..., None] == jnp.arange(INSTANCES, dtype=labels.dtype).reshape(1, 1, -1)
+    member = labels[..., None] == jnp.arange(capacity + 1, dtype=labels.dtype).reshape(1, 1, -1)
     size, within = jnp.sum(member, axis=(0, 1)), jnp.sum(member & on_it[..., None], axis=(0, 1))
     is_phantom = (2 * within > size) & (size <= jnp.sum(of_target))
     phantom = jnp.any(member & is_phantom.reshape(1, 1, -1), axis=-1)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mechsearch_jax.images.labels import INSTANCES
+from mechsearch_jax.images.labels import MOST
 from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
@@ -88,8 +88,8 @@ def _rest(array: np.ndarray, path: PathLike) -> tuple[int | None, Camera]:
     if not isinstance(value, dict) or set(value) != {"target_id", "camera"} or not isinstance(value["camera"], dict):
         raise InputError(f"{path}: {REST} must be JSON with the keys target_id and camera")
     target_id = value["target_id"]
-    if target_id is not None and (type(target_id) is not int or not 0 <= target_id < INSTANCES):
-        raise InputError(f"{path}: target_id {shown(target_id)} must be null or from 0 to {INSTANCES - 1}")
+    if target_id is not None and (type(target_id) is not int or not 0 <= target_id <= MOST):
+        raise InputError(f"{path}: target_id {shown(target_id)} must be null or from 0 to {MOST}")
     document = Document(str(path), {"camera": value["camera"]}, {})
     return target_id, with_table(document, "camera", Camera())
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
 from PIL import Image
 
-from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.labels import CAPACITY, OTHER, more_room
 from mechsearch_jax.images.lens import Lens, distortion_of
 from mechsearch_jax.runtime.errors import InputError, nearest, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing, save_json
@@ -73,12 +73,15 @@ def load_colour(path: PathLike) -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(image[..., :3])
 
 
-def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
+def load_mask(
+    path: PathLike, background: int, capacity: int = CAPACITY
+) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
     """Read a mask and renumber its objects for a `Recogniser`.
 
     Args:
       path: of the file; its objects may have any numbers.
       background: the number of the background, as are negative ones.
+      capacity: how many objects the recogniser can hold, beside the target.
 
     Returns:
       The mask, and the new number for each number in the file.
@@ -86,11 +89,11 @@ def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], 
     Raises:
       InputError: the file cannot be read, is not a mask, or has too many objects.
     """
-    return numbered(load_pixels(path), background, str(path))
+    return numbered(load_pixels(path), background, str(path), capacity)
 
 
 def numbered(
-    image: Shaped[np.ndarray, "..."], background: int, where: str
+    image: Shaped[np.ndarray, "..."], background: int, where: str, capacity: int = CAPACITY
 ) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
     """A mask for a `Recogniser` of one with any numbers; as `load_mask`, whose messages begin with `where`.
 
@@ -107,8 +110,10 @@ def numbered(
                 f"{where}: number {number} covers {100 * pixels / image.size:.0f}% of the image; if it stands for no "
                 f"object, say so: --background {number}"
             )
-    if len(named) > INSTANCES:
-        raise InputError(f"{where}: names {len(named)} objects; at most {INSTANCES} can be told apart")
+    if len(named) > capacity + 1:
+        raise InputError(
+            f"{where}: names {len(named)} objects; at most {capacity + 1} can be told apart{more_room(capacity)}"
+        )
     new = {number: i for i, (number, _) in enumerate(named)}
     mask = np.full(image.shape, OTHER, np.int32)
     for number, i in new.items():

@@ -20,7 +20,7 @@ from mechsearch_jax.images.camera_pose import STAGES, PoseEstimate, estimate_pos
 from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.colour import ColourDetection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.images.detection import evened
-from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER
 from mechsearch_jax.images.planes import Plane, find_plane
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
@@ -115,12 +115,12 @@ def _find_floor(key, rng, shelf, points, inside) -> Plane:
     return Plane(jnp.array([0.0, 0.0, 1.0]), jnp.float32(shelf.board), jnp.int32(0))
 
 
-def _segment(colour, depth, points, foreground, mask) -> Int[np.ndarray, "h w"]:
+def _segment(colour, depth, points, foreground, mask, capacity) -> Int[np.ndarray, "h w"]:
     if mask is None:
         labels = cluster_by_colour(colour, depth, points, foreground)
     else:
         labels = np.where(foreground, mask, OTHER).astype(np.int32)
-    return np.where((labels >= 0) & (labels < INSTANCES), labels, OTHER).astype(np.int32)
+    return np.where((labels >= 0) & (labels <= capacity), labels, OTHER).astype(np.int32)
 
 
 def _inside(shelf: Shelf, points: np.ndarray) -> Bool[np.ndarray, "h w"]:
@@ -147,6 +147,7 @@ def prepare(
     joints: Float[np.ndarray, " 7"] | None = None,
     opening: float = 0.0,
     target: TargetColour | None = None,
+    capacity: int = CAPACITY,
 ) -> PreparedImage:
     """Segment the objects in a depth and a colour image of the shelf.
 
@@ -156,12 +157,13 @@ def prepare(
       shelf: the shelf.
       depth: along the camera's axis [m]; 0, infinite or NaN where nothing was measured.
       colour: red, green and blue in 0 to 1, registered to the depth image, float, shape (h, w, 3).
-      mask: whole numbers, the segment of every pixel, 0 to 8, others for none; it need not separate
+      mask: whole numbers, the segment of every pixel, 0 to `capacity`, others for none; it need not separate
         shelf and robot. If None, pixels are clustered by colour.
       joints: the robot's joint angles when the images were taken [rad]; without them the pose is used as given, and the
         robot must be out of sight.
       opening: distance between its fingers [m].
       target: the target's colour; red if None.
+      capacity: how many objects the recogniser can hold, beside the target.
 
     Raises:
       InputError: an image has the wrong size, type or unit.
@@ -187,9 +189,9 @@ def prepare(
         distance, _ = panda_distance(jnp.asarray(points[foreground]), angles, fingers)
         other[foreground] = np.asarray(distance) <= ROBOT_CLEARANCE
         foreground &= ~other
-    labels = _segment(colour, depth, points, foreground, mask)
+    labels = _segment(colour, depth, points, foreground, mask, capacity)
     labels = np.where(foreground | other, labels, np.where(np.isfinite(depth), FREE, MISSING)).astype(np.int32)
     image = jnp.asarray(labels)
     pixels = jnp.asarray(colour, jnp.float32).reshape(-1, 3)
-    detection = detect_target(pixels, image.reshape(-1), INSTANCES, target or TargetColour.lit())
+    detection = detect_target(pixels, image.reshape(-1), capacity + 1, target or TargetColour.lit())
     return PreparedImage(image, jnp.asarray(depth), detection, floor, pose, camera)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.perception.hypotheses import SLOTS, pixels_of
+from mechsearch_jax.perception.hypotheses import pixels_of
 from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.selection import Costs, Sample, passed, point_cost
 from mechsearch_jax.perception.solids import surface_distance
@@ -28,7 +28,7 @@ LEAST_MISFIT, LEAST_MARGIN = 0.01, 0.01
 
 
 class Measures(PyTreeNode):
-    """What is measured of each object, shape (8,).
+    """What is measured of each object, shape (N,).
 
     Attributes:
       valid: whether there is an object.
@@ -50,22 +50,22 @@ def measures_of(
     labels: Int[Array, "h w"],
     image: LabelledImage,
     sample: Sample,
-    error: Float[Array, " 8"],
-    margin: Float[Array, " 8"],
+    error: Float[Array, " n"],
+    margin: Float[Array, " n"],
     costs: Costs,
 ) -> Measures:
     """What is measured of the objects of an image.
 
     Args:
-      objects: eight slots.
+      objects: in N slots.
       labels: the pixels of each object.
       image: its points.
       sample: rays of the image.
       error, margin: see `Measures`.
       costs: what a point or ray costs.
     """
-    pixels = pixels_of(labels)
-    member = (labels.reshape(-1)[None] == jnp.arange(SLOTS)[:, None]) & sample.judged.reshape(1, -1)
+    pixels = pixels_of(labels, objects.capacity)
+    member = (labels.reshape(-1)[None] == jnp.arange(objects.capacity)[:, None]) & sample.judged.reshape(1, -1)
     flat = jnp.where(member.any(axis=0)[:, None], image.points.reshape(-1, 3), 0.0)
     badly = jnp.sum(jnp.where(member, point_cost(surface_distance(objects, flat), sample, costs), 0.0), axis=1)
     return Measures(

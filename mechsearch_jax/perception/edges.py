@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.images.cloud import above_board, shelf_view, surfaces, thinned_view
-from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.labels import CAPACITY, MOST, OTHER
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import longer
@@ -151,7 +151,7 @@ def _away_from_edges(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.n
     depth, mask = (view.cut(np.asarray(image)) for image in (depth, mask))
     points = back_project(view.camera, jnp.asarray(np.where(depth > 0, depth, np.nan)))
     standing = np.asarray(above_board(shelf, points, FACES))
-    named = np.where((mask >= 0) & (mask < INSTANCES), mask, OTHER)
+    named = np.where((mask >= 0) & (mask <= MOST), mask, OTHER)
     near = round(max(1.0, NEAR * longer(camera)))
     shares = []
     for axis, sign in ((1, 1), (1, -1), (0, 1), (0, -1)):
@@ -173,10 +173,11 @@ def _on_others(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.ndarray
     seen = view.of(jnp.asarray(depth, jnp.float32))
     points = back_project(view.camera, jnp.where(seen > 0, seen, jnp.nan))
     instances = view.of(jnp.asarray(mask))
-    instances = jnp.where((instances >= 0) & (instances < INSTANCES), instances, OTHER).astype(jnp.int8)
-    own = on_own_surfaces(points, instances, above_board(shelf, points))
+    instances = jnp.where((instances >= 0) & (instances <= MOST), instances, OTHER).astype(jnp.int8)
+    capacity = CAPACITY if int(jnp.max(instances)) <= CAPACITY else MOST
+    own = on_own_surfaces(points, instances, above_board(shelf, points), capacity)
     before, after = (
-        np.bincount(np.asarray(labels)[np.asarray(labels) >= 0], minlength=INSTANCES) for labels in (instances, own)
+        np.bincount(np.asarray(labels)[np.asarray(labels) >= 0], minlength=MOST + 1) for labels in (instances, own)
     )
     left_out = before - after
     least = LEAST_LEFT_OUT * longer(camera) ** 2 / view.stride**2
@@ -187,9 +188,12 @@ def _on_others(camera: Camera, shelf: Shelf, depth: np.ndarray, mask: np.ndarray
     return f"{100 * share[worst]:.0f}% of number {worst} lies on other things, and is left out"
 
 
-@cached_jit()
+@cached_jit(static_argnames=("capacity",))
 def on_own_surfaces(
-    points: Float[Array, "h w 3"], instances: Int[Array, "h w"], standing: Bool[Array, "h w"]
+    points: Float[Array, "h w 3"],
+    instances: Int[Array, "h w"],
+    standing: Bool[Array, "h w"],
+    capacity: int = CAPACITY,
 ) -> Int[Array, "h w"]:
     """A mask in which those pixels of an instance are OTHER that lie on a surface of another thing.
 
@@ -201,13 +205,14 @@ def on_own_surfaces(
       points: in the world [m]; NaN where nothing was measured.
       instances: the mask as labels of `images.labels`.
       standing: pixels that show something on the shelf; others keep their labels.
+      capacity: instances are numbered up to it; static.
     """
     labels, counted = instances.reshape(-1), standing.reshape(-1)
     number = surfaces(points, standing).reshape(-1)
     named = labels >= 0
-    pixels = jnp.zeros((labels.size, INSTANCES + 1), jnp.int32)
-    pixels = pixels.at[number, jnp.where(named, labels, INSTANCES)].add(counted.astype(jnp.int32))
+    pixels = jnp.zeros((labels.size, capacity + 2), jnp.int32)
+    pixels = pixels.at[number, jnp.where(named, labels, capacity + 1)].add(counted.astype(jnp.int32))
     share = pixels / jnp.maximum(jnp.sum(pixels, axis=1, keepdims=True), 1)
-    main, owner = jnp.argmax((share * pixels)[:, :INSTANCES], axis=0), jnp.argmax(pixels, axis=1)
+    main, owner = jnp.argmax((share * pixels)[:, : capacity + 1], axis=0), jnp.argmax(pixels, axis=1)
     own = (owner[number] == labels) | (main[jnp.maximum(labels, 0)] == number)
     return jnp.where(named & counted & ~own, OTHER, labels).astype(instances.dtype).reshape(instances.shape)

@@ -23,10 +23,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import yaw_rotation
 from mechsearch_jax.images.detection import fitted_pose, near_target, without_phantoms
-from mechsearch_jax.images.labels import MISSING, OTHER
+from mechsearch_jax.images.labels import MISSING, MOST, OTHER
 from mechsearch_jax.perception.confidence import Measures, confidence_of, measures_of
 from mechsearch_jax.perception.hypotheses import (
-    SLOTS,
     WAYS,
     Fits,
     bordering,
@@ -89,7 +88,7 @@ class ExplanationConfig(Costs):
 
     def __post_init__(self):
         check_numbers(self, positive=("points", "rays", "wrong"))
-        for name, most in (("splits", SLOTS), ("merges", SLOTS**2)):
+        for name, most in (("splits", MOST), ("merges", MOST**2)):
             if (number := getattr(self, name)) > most:
                 raise InputError(f"ExplanationConfig: {name} ({number}) must be at most {most}")
 
@@ -101,12 +100,12 @@ class Fitted(PyTreeNode):
     """What was made of a labelled image.
 
     Attributes:
-      objects: eight slots, with `superquadric.standard_edges`.
+      objects: N slots, with `superquadric.standard_edges`.
       target_pose: x, y [m] and yaw [rad], meaningless but finite if the target has no pixels.
-      confidence: of each object, see `Observation`, shape (8,).
+      confidence: of each object, see `Observation`, shape (N,).
       measures: what it comes from.
       labels: the pixels of each object, as `LabelledImage.labels`.
-      changed: whether an object is not that of the given segment, bool, shape (8,).
+      changed: whether an object is not that of the given segment, bool, shape (N,).
     """
 
     objects: Superquadrics
@@ -195,11 +194,13 @@ def explained_image(
     least: Float[Array, ""] | float = 0.0,
 ) -> Fitted:
     """The objects that explain an image; arguments as of `Fitter`, `config` is static."""
+    most = {"splits": min(config.splits, image.capacity), "merges": min(config.merges, image.capacity**2)}
+    config = dataclasses.replace(config, **most)
     pose, has_pixels = fitted_pose(keys[1], target, shelf, camera, image.points, image.depth, image.of_target)
     on_it = near_target(target, shelf, pose, image.points) & has_pixels
-    labels = without_phantoms(image.labels, on_it, image.of_target)
+    labels = without_phantoms(image.labels, on_it, image.of_target, image.capacity)
     # An instance beyond the slots has no object.
-    image = image.replace(labels=jnp.where(labels < SLOTS, labels, OTHER).astype(labels.dtype))
+    image = image.replace(labels=jnp.where(labels < image.capacity, labels, OTHER).astype(labels.dtype))
     place = jnp.stack([pose[0], pose[1], jnp.float32(target.height(shelf))])
     body = main_body(target, place[None], yaw_rotation(pose[2])[None], has_pixels[None])
     fitted_target = _FittedTarget(body, pose, on_it)
@@ -241,12 +242,12 @@ def _explain(
     least: Float[Array, ""] | float,
 ) -> Fitted:
     """`explained_image` for a fitted target."""
-    keys, body, shelf = jax.random.split(key, 3), fitted_target.body, settings[2]
-    segments = image.labels[None] == jnp.arange(SLOTS, dtype=image.labels.dtype)[:, None, None]
-    small = pixels_of(image.labels) <= jnp.sum(image.of_target)
+    keys, body, shelf, slots = jax.random.split(key, 3), fitted_target.body, settings[2], image.capacity
+    segments = image.labels[None] == jnp.arange(slots, dtype=image.labels.dtype)[:, None, None]
+    small = pixels_of(image.labels, slots) <= jnp.sum(image.of_target)
 
     def present(fits):
-        base = jax.tree.map(lambda a: a[:SLOTS], fits.objects)
+        base = jax.tree.map(lambda a: a[:slots], fits.objects)
         return base.replace(valid=base.valid & ~(_inside(base, body) & small))
 
     def tried(fits):
@@ -274,10 +275,10 @@ def _explain(
     start = _zeros(lambda: tried(nothing)).replace(**segmented)
     fits, given = jax.lax.fori_loop(0, 2, step, (nothing, start))
     objects = fits.objects.replace(
-        valid=jnp.concatenate([present(fits).valid, fits.objects.valid[SLOTS:] & ~_inside(fits.objects, body)[SLOTS:]])
+        valid=jnp.concatenate([present(fits).valid, fits.objects.valid[slots:] & ~_inside(fits.objects, body)[slots:]])
     )
     everything = jax.tree.map(lambda *a: jnp.concatenate(a), objects, body)
-    selection = select_objects(everything, given.moves, given.sample, pixels_of(given.image.labels), config)
+    selection = select_objects(everything, given.moves, given.sample, pixels_of(given.image.labels, slots), config)
     return _chosen(fits.replace(objects=objects), given, selection, fitted_target, settings[1:3], config)
 
 
@@ -299,10 +300,10 @@ def _tried(
     camera, shelf = setting
     # Pixels of segments without an object belong to none.
     image = image.replace(labels=_without(image.labels, ~base.valid))
-    slots = jnp.arange(SLOTS, dtype=image.labels.dtype)
+    slots = jnp.arange(image.capacity, dtype=image.labels.dtype)
     segments = image.labels[None] == slots[:, None, None]
     sample = sample_of(key, image, base, camera, shelf, config)
-    pixels = pixels_of(image.labels)
+    pixels = pixels_of(image.labels, image.capacity)
     belongs = sample.label[None] == slots[:, None]
     badly = jnp.sum(point_cost(surface_distance(base, sample.points), sample, config) * belongs, axis=1) * sample.weight
     bad = jnp.where(base.valid, badly + passed(base, sample, config), 0.0)
@@ -320,25 +321,26 @@ def _tried(
     parted = jnp.repeat(divided, 2) & (counts > least) & ~of_target
 
     # What something hides in the middle shows two segments that do not border on each other, but whose objects overlap.
-    borders = bordering(image.points, image.labels, config.jump)
+    borders = bordering(image.points, image.labels, config.jump, image.capacity)
     deep = jnp.triu(penetrations(base) - config.touching, 1)
     either = (borders >= 3) & (doubtful[:, None] | doubtful[None])
     likely = jnp.where(either, borders, 0.0) + 1e4 * jnp.maximum(deep, 0.0)
     likely, pair = jax.lax.top_k(likely.reshape(-1), config.merges)
-    low, high = pair // SLOTS, pair % SLOTS
+    low, high = pair // image.capacity, pair % image.capacity
     joined = (likely > 0.0) & base.valid[low] & base.valid[high]
     union = (image.labels[None] == low[:, None, None]) | (image.labels[None] == high[:, None, None])
 
     masks = jnp.concatenate([segments, halves, union])
     boards = standing(masks, base, sample, shelf.board)
-    raised = base.valid & (boards[:SLOTS] > shelf.board)
+    raised = base.valid & (boards[: image.capacity] > shelf.board)
     active = jnp.concatenate([raised, parted, joined])
-    return _Tried(image, sample, masks, active, boards, moves_of(chosen, divided, (low, high), joined, config.drops))
+    moves = moves_of(image.capacity, chosen, divided, (low, high), joined, config.drops)
+    return _Tried(image, sample, masks, active, boards, moves)
 
 
-def _without(labels: Int[Array, "h w"], absent: Bool[Array, " 8"]) -> Int[Array, "h w"]:
+def _without(labels: Int[Array, "h w"], absent: Bool[Array, " n"]) -> Int[Array, "h w"]:
     """Labels in which the pixels of absent objects are OTHER."""
-    is_absent = (labels >= 0) & absent[jnp.clip(labels, 0, SLOTS - 1)]
+    is_absent = (labels >= 0) & absent[jnp.clip(labels, 0, len(absent) - 1)]
     return jnp.where(is_absent, OTHER, labels).astype(labels.dtype)
 
 
@@ -361,27 +363,27 @@ def _chosen(
     setting: tuple[Camera, Shelf],
     config: ExplanationConfig,
 ) -> Fitted:
-    """The selected objects in eight slots, those of segments that stay in theirs, with the labels of their pixels."""
-    image, sample = given.image, given.sample
+    """The selected objects in slots, those of segments that stay in theirs, with the labels of their pixels."""
+    image, sample, slots = given.image, given.sample, given.image.capacity
     # There may be no hypotheses.
-    stays, new = selection.selected[:SLOTS], jnp.pad(selection.selected[SLOTS:-1], (0, SLOTS))
-    order = jnp.argsort(~new, stable=True)[:SLOTS]
+    stays, new = selection.selected[:slots], jnp.pad(selection.selected[slots:-1], (0, slots))
+    order = jnp.argsort(~new, stable=True)[:slots]
     free = jnp.cumsum(~stays) - 1
     filled = ~stays & (free < jnp.sum(new))
-    source = jnp.where(filled, SLOTS + order[jnp.clip(free, 0, SLOTS - 1)], jnp.arange(SLOTS))
+    source = jnp.where(filled, slots + order[jnp.clip(free, 0, slots - 1)], jnp.arange(slots))
     fits, boards = jax.tree.map(lambda a: a[source], (fits, given.boards))
     scene = fits.objects.replace(valid=stays | filled)
 
     # Pixels of segments that are no more go to the nearest of the objects that they lie on. What was no object's, such
     # as an undetected target, stays so.
     labels = image.labels
-    gone = (labels >= 0) & ~stays[jnp.clip(labels, 0, SLOTS - 1)]
+    gone = (labels >= 0) & ~stays[jnp.clip(labels, 0, slots - 1)]
     flat = jnp.where((labels == MISSING).reshape(-1, 1), 0.0, image.points.reshape(-1, 3))
     near = jnp.where(scene.valid[:, None], jnp.abs(surface_distance(scene, flat)), jnp.inf)
     nearest = jnp.where(jnp.min(near, axis=0) < sample.exact + config.wrong, jnp.argmin(near, axis=0), OTHER)
     nearest = jnp.where(fitted_target.on_it, OTHER, nearest.reshape(labels.shape))
     labels = jnp.where(gone, nearest, labels).astype(labels.dtype)
-    masks = labels[None] == jnp.arange(SLOTS, dtype=labels.dtype)[:, None, None]
+    masks = labels[None] == jnp.arange(slots, dtype=labels.dtype)[:, None, None]
     fits = mended(fits.replace(objects=scene), image, masks, boards, *setting)
     scene = fits.objects
     measures = measures_of(scene, labels, image, sample, fits.error, selection.margin[source], config)

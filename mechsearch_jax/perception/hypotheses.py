@@ -22,8 +22,6 @@ from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Number of objects of an observation.
-SLOTS = 8
 # Ways in which a segment is divided: see `parts`.
 WAYS = 3
 # Ways whose parts differ in less than this share of the segment's pixels are one.
@@ -104,9 +102,7 @@ def distinct(first: Bool[Array, "k ways h w"], pixels: Int[Array, " k"]) -> Bool
     return ~jnp.any(jnp.tril(alike, -1), axis=-1)
 
 
-def bordering(
-    points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float, count: int = SLOTS
-) -> Float[Array, "n n"]:
+def bordering(points: Float[Array, "h w 3"], labels: Int[Array, "h w"], jump: float, count: int) -> Float[Array, "n n"]:
     """Number of neighbouring pixels of every two of `count` segments whose points are near; each pair once, above the
     diagonal."""
     total = jnp.zeros((count, count))
@@ -248,7 +244,7 @@ def standing(
       board: its height [m].
     """
     member = masks.reshape(masks.shape[0], -1)[:, sample.index] & (sample.label >= 0)[None]
-    points, of_base = sample.points, sample.label[None] == jnp.arange(SLOTS)[:, None]
+    points, of_base = sample.points, sample.label[None] == jnp.arange(base.capacity)[:, None]
     tops = jax.vmap(lambda own: _percentile(points[:, 2], own, TOP))(of_base)
 
     def over_it(solid):
@@ -272,6 +268,6 @@ def _percentile(values: Float[Array, " p"], chosen: Bool[Array, " p"], share: fl
     return jnp.where(jnp.any(chosen), ordered[last], -jnp.inf)
 
 
-def pixels_of(labels: Int[Array, "h w"]) -> Int[Array, " 8"]:
-    """Number of pixels of each object."""
-    return jnp.sum(labels.reshape(-1)[None] == jnp.arange(SLOTS)[:, None], axis=1)
+def pixels_of(labels: Int[Array, "h w"], count: int) -> Int[Array, " count"]:
+    """Number of pixels of each of `count` objects."""
+    return jnp.sum(labels.reshape(-1)[None] == jnp.arange(count)[:, None], axis=1)

@@ -18,7 +18,7 @@ from mechsearch_jax.images.checks import check_images
 from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.images.detection import ColouredDepth, coloured_pixels, detect, no_detection
-from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER, check_capacity
 from mechsearch_jax.images.measured import measured_share
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.observation import Observation
@@ -85,6 +85,7 @@ class ViewRecogniser(PyTreeNode):
       refinement: how the network's shapes are fitted to the depth image.
       fitter: fits objects to the segments of images without a mask.
       mask_fitter: fits objects to the segments of a mask.
+      capacity: number of slots for objects.
     """
 
     segmenter: Segmenter
@@ -94,6 +95,7 @@ class ViewRecogniser(PyTreeNode):
     refinement: RefinementConfig = static(default_factory=RefinementConfig)
     fitter: Fitter = static(default_factory=Explaining)
     mask_fitter: Fitter = static(default=as_segmented)
+    capacity: int = static(default=CAPACITY)
 
     @classmethod
     def of(
@@ -106,20 +108,23 @@ class ViewRecogniser(PyTreeNode):
         refinement: RefinementConfig | None = None,
         fitter: Fitter | None = None,
         mask_fitter: Fitter | None = None,
+        capacity: int = CAPACITY,
     ) -> ViewRecogniser:
         """The recogniser of a target; see `Recogniser` for the defaults.
 
         Raises:
-          InputError: weights are missing, damaged or of another network.
+          InputError: weights are missing, damaged or of another network, or the capacity is impossible.
         """
+        check_capacity(capacity)
         return cls(
-            _as_pytree(segmenter or NetworkSegmenter.of()),
+            _as_pytree(segmenter or NetworkSegmenter.of(capacity=capacity)),
             ShapeNetwork.of(weights),
             _as_pytree(detector or TargetColour.lit()),
             target,
             refinement or RefinementConfig(),
             fitter or Explaining(),
             mask_fitter or as_segmented,
+            capacity,
         )
 
     def __call__(self, camera: Camera, view: View, shelf: Shelf, images: ViewImages) -> Observation:
@@ -184,6 +189,7 @@ class Recogniser:
         refinement: RefinementConfig | None = None,
         fitter: Fitter | None = None,
         mask_fitter: Fitter | None = None,
+        capacity: int = CAPACITY,
     ):
         """Set up recognition for a problem.
 
@@ -198,9 +204,12 @@ class Recogniser:
             better; `as_segmented` keeps the segmenter's. With `InParts(Connected(), joining=join_floating)`
             of `parts.in_parts`, `parts.segments` and `parts.joining` objects are bodies of up to four parts.
           mask_fitter: by default `as_segmented`, which keeps the mask's segments, as `parts.in_parts.InParts()` does.
+          capacity: number of objects that an observation can hold, 1 to 16. A planner's programs, time and memory grow
+            with it.
 
         Raises:
-          InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
+          InputError: the camera does not see the shelf, weights are missing, damaged or of another network, or the
+            capacity is impossible.
         """
         camera = camera or problem.camera
         check_camera(camera, problem.shelf)
@@ -214,6 +223,7 @@ class Recogniser:
                 refinement=refinement,
                 fitter=fitter,
                 mask_fitter=mask_fitter,
+                capacity=capacity,
             )
             self._set(core, camera, thinned_view(camera, problem.shelf), problem.shelf)
 
@@ -253,8 +263,8 @@ class Recogniser:
         False. It is visible with more than 100 pixels at 1280 x 720, or the same share of other images, in the shelf's
         space and with a measured depth.
 
-        With a mask, slot i of the objects is instance i; if the target is one of the instances, instance 8 takes its
-        slot. Without a mask, the order of the slots is arbitrary.
+        With a mask, slot i of the objects is instance i; if the target is one of the instances, the one whose number
+        is the capacity takes its slot. Without a mask, the order of the slots is arbitrary.
 
         Args:
           key: for recognisers that draw at random, which are called alike; the same images give the same observation
@@ -262,17 +272,18 @@ class Recogniser:
           depth: float (H, W), metres along the camera's z; 0, NaN or 65.535 where nothing was measured, infinite where
             there is nothing for at least 3 m.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
-          mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to 8, or
-            OTHER (-1), FREE (-2) or MISSING (-3) of `images.labels`. Points on the shelf's faces always count as FREE.
+          mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to the
+            capacity, or OTHER (-1), FREE (-2) or MISSING (-3) of `images.labels`. Points on the shelf's faces always
+            count as FREE.
           target_id: the target's number in the mask; negative if the mask does not show it.
 
         Returns:
-          The observation, with eight slots for objects.
+          The observation, with as many slots for objects as the capacity says.
 
         Raises:
           InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
-        check_images(self.camera, depth, colour, mask, target_id)
+        check_images(self.camera, depth, colour, mask, target_id, self.core.capacity)
         return self.unchecked(key, depth, colour, mask, target_id)
 
     @in_own_settings
@@ -341,39 +352,40 @@ def labelled(
         visible, of_target = detection.visible, detection.pixels
         # As objects, small segments would rule out the pose of a target that is not detected.
         segments = core.segmenter(key, shelf, points, of_target | detection.unclear)
-        labels = large_segments(segments, SAMPLED * threshold)
+        labels = large_segments(segments, SAMPLED * threshold, core.capacity)
     else:
-        instances = on_own_surfaces(points, _instances(mask), above_board(shelf, points))
+        instances = _instances(mask, core.capacity)
+        instances = on_own_surfaces(points, instances, above_board(shelf, points), core.capacity)
         # The mask says what is one thing, so its colour alone tells the target from the others.
         coloured = jnp.zeros(seen.shape, bool)
         if colour is not None:
             coloured = coloured_pixels(core.detector, colour, seen) & near
-        of_target, freed = _target_in(instances, coloured, target_id)
+        of_target, freed = _target_in(instances, coloured, target_id, core.capacity)
         of_target &= near
-        labels = _labels(instances, freed, shelf, points)
+        labels = _labels(instances, freed, shelf, points, core.capacity)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
         visible = (jnp.sum(of_target) > threshold).astype(bool)
-    image = LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible)
+    image = LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible, core.capacity)
     return image, visible
 
 
-def large_segments(labels: Int[Array, "h w"], pixels: float | Array) -> Int[Array, "h w"]:
+def large_segments(labels: Int[Array, "h w"], pixels: float | Array, capacity: int = CAPACITY) -> Int[Array, "h w"]:
     """Labels with segments, numbered from 0, of at most `pixels` pixels set to OTHER."""
-    small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
+    small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(capacity + 1)[None], axis=0) <= pixels
     return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)
 
 
-def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:
+def _instances(mask: Int[Array, "h w"], capacity: int) -> Int[Array, "h w"]:
     """The mask as labels of `images.labels`, int8; other numbers become OTHER."""
-    is_label = (mask >= MISSING) & (mask < INSTANCES)
+    is_label = (mask >= MISSING) & (mask <= capacity)
     return jnp.where(is_label, mask, OTHER).astype(jnp.int8)
 
 
 def _target_in(
-    instances: Int[Array, "h w"], coloured: Bool[Array, "h w"], target_id: Any
+    instances: Int[Array, "h w"], coloured: Bool[Array, "h w"], target_id: Any, capacity: int
 ) -> tuple[Bool[Array, "h w"], Int[Array, ""]]:
     """The target's pixels in a mask, and its instance's number, or the last number if it is not an instance."""
-    numbers = jnp.arange(INSTANCES)
+    numbers = jnp.arange(capacity + 1)
     member = instances[..., None] == numbers.reshape(1, 1, -1)
     if target_id is not None:
         is_target = numbers == target_id
@@ -384,11 +396,11 @@ def _target_in(
         is_target = 2 * in_colour > jnp.sum(member, axis=(0, 1))
         rest = coloured & (instances == OTHER)
     of_target = jnp.any(member & is_target.reshape(1, 1, -1), axis=-1) | rest
-    return of_target, jnp.where(jnp.any(is_target), jnp.argmax(is_target), INSTANCES - 1).astype(jnp.int8)
+    return of_target, jnp.where(jnp.any(is_target), jnp.argmax(is_target), capacity).astype(jnp.int8)
 
 
 def _labels(
-    instances: Int[Array, "h w"], freed: Int[Array, ""], shelf: Shelf, points: Float[Array, "h w 3"]
+    instances: Int[Array, "h w"], freed: Int[Array, ""], shelf: Shelf, points: Float[Array, "h w 3"], capacity: int
 ) -> Int[Array, "h w"]:
     """The labels of an image with a mask: the objects' slots; the rest by the places of the points.
 
@@ -397,8 +409,9 @@ def _labels(
       freed: the target's number, which the last instance takes.
       shelf: in the image.
       points: in the world [m].
+      capacity: the last instance's number.
     """
-    body = jnp.where(instances == freed, OTHER, jnp.where(instances == INSTANCES - 1, freed, instances))
+    body = jnp.where(instances == freed, OTHER, jnp.where(instances == capacity, freed, instances))
     # Something in front of the shelf, such as the robot, hides what is behind it.
     before = (points[..., 0] <= shelf.front - OVERHANG) & (points[..., 2] > shelf.board) & (instances != FREE)
     labels = jnp.where(above_board(shelf, points), body, jnp.where(before, OTHER, FREE))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.images.cloud import middle
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.images.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
@@ -144,9 +145,11 @@ class LabelledImage(PyTreeNode):
         measured.
       labels: as in `images.labels`, shape (h, w).
       of_target: points to which the target's pose is fitted, bool, shape (h, w).
+      capacity: number of slots for objects, static; segments with larger numbers have none.
     """
 
     points: jax.Array
     depth: jax.Array
     labels: jax.Array
     of_target: jax.Array
+    capacity: int = static(default=CAPACITY)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.images.cloud import above_board, cloud_of, hanging, middle, resample, surfaces
-from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.labels import CAPACITY, FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.runtime.pytree import PyTreeNode, static
 from mechsearch_jax.workspace.shelf import Shelf
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 # included, in so many rounds; points of segments of fewer than `LEAST_SEGMENT` points take the label of the nearest
 # other segment. Points without a label within `REACH` become OTHER.
 NEIGHBOURS, ROUNDS, LEAST_SEGMENT, REACH = 9, 1, 8, 0.02
+# Smaller surfaces do not count where those of an image are halved [pixels].
+SURFACE = 60
 # Parts of a cloud in which the nearest point is searched for, if they are of equal size.
 _PARTS = 64
 
@@ -44,7 +46,8 @@ class Segmenter(Protocol):
           of_target: the target's pixels.
 
         Returns:
-          Labels as in `images.labels`, with at most eight segments, 0 to 7; the target's pixels are OTHER.
+          Labels as in `images.labels`, with at most as many segments as the recogniser has slots, from 0; the
+          target's pixels are OTHER.
         """
         ...
 
@@ -132,16 +135,33 @@ def spread_labels(
     return jnp.where(~measured, MISSING, jnp.where(candidates, nearest_label, FREE)).astype(jnp.int8)
 
 
-def leave_out_smallest(labels: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """Labels with the numbers 0 to `INSTANCES - 2`: the smallest segment becomes OTHER if there are `INSTANCES`.
+def leave_out_smallest(labels: Int[Array, "h w"], count: int, capacity: int) -> Int[Array, "h w"]:
+    """Labels with the numbers 0 to `capacity - 1`: of `count` segments the smallest become OTHER.
 
-    The last segment takes the number of the smallest, or of an absent one.
+    Later segments take their numbers, or those of absent ones.
     """
-    last = INSTANCES - 1
-    pixels = jnp.sum(labels[..., None] == jnp.arange(INSTANCES).reshape(1, 1, -1), axis=(0, 1))
-    smallest = jnp.argmin(pixels)
-    rest = jnp.where(labels == last, smallest, labels)
-    return jnp.where(labels == smallest, OTHER, rest).astype(jnp.int8)
+    numbers = jnp.arange(count)
+    pixels = jnp.sum(labels[..., None] == numbers.reshape(1, 1, -1), axis=(0, 1))
+    kept = jnp.zeros(count, bool).at[jnp.argsort(pixels)[max(count - capacity, 0) :]].set(True)
+    later = kept & (numbers >= capacity)
+    free = jnp.argsort(kept[:capacity])
+    number = jnp.where(later, free[jnp.cumsum(later) - 1], jnp.where(kept, numbers, OTHER))
+    return jnp.where(labels >= 0, number[labels], labels).astype(jnp.int8)
+
+
+def on_the_right(objects: Bool[Array, "h w"], surface: Int[Array, "h w"]) -> Bool[Array, "h w"]:
+    """The pixels of objects whose surfaces are farther to the right than most: in the image about half of the things.
+
+    Args:
+      objects: pixels of objects.
+      surface: numbers of their surfaces, below the number of pixels.
+    """
+    number, there = surface.reshape(-1), objects.reshape(-1).astype(jnp.float32)
+    column = jnp.broadcast_to(jnp.arange(objects.shape[1], dtype=jnp.float32)[None], objects.shape).reshape(-1)
+    size, total = (jnp.zeros(number.size).at[number].add(weight) for weight in (there, there * column))
+    middle = total / jnp.maximum(size, 1.0)
+    half = jnp.nanmedian(jnp.where(size >= SURFACE, middle, jnp.nan))
+    return objects & (middle > half)[number].reshape(objects.shape)
 
 
 class NetworkSegmenter(PyTreeNode):
@@ -151,31 +171,48 @@ class NetworkSegmenter(PyTreeNode):
       parameters: of the network.
       network: static.
       view: camera and shelf in its training, if its card records them; static.
+      capacity: the most segments; static. If the network tells fewer instances apart, it sees the left and the right
+        half of the surfaces one after the other.
     """
 
     parameters: Any
     network: SegmentationNetwork = static()
     view: TrainedView | None = static(default=None)
+    capacity: int = static(default=CAPACITY)
 
     @classmethod
-    def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
-        """The segmenter with the given weights; the package's if None."""
+    def of(cls, weights: Weights | None = None, capacity: int = CAPACITY) -> NetworkSegmenter:
+        """The segmenter with the given weights, the package's if None, of at most so many segments."""
         from mechsearch_jax.networks.weights import shipped_weights
 
         weights = weights or shipped_weights("segmentation")
-        return cls(weights.parameters, cast("SegmentationNetwork", weights.network), weights.view)
+        return cls(weights.parameters, cast("SegmentationNetwork", weights.network), weights.view, capacity)
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
-        from mechsearch_jax.networks.segmentation import apply_network
-
         objects = above_board(shelf, points) & ~of_target
         surface = surfaces(points, objects)
         objects &= ~hanging(shelf, points, objects, surface)
+        segmented = functools.partial(self._segmented, shelf, points, surface)
+        if self.capacity < INSTANCES:
+            labels, count = segmented(key, objects), INSTANCES
+        else:
+            right, count = on_the_right(objects, surface), 2 * INSTANCES
+            sides = jnp.stack([objects & ~right, objects & right])
+            left_labels, labels = jax.lax.map(lambda side: segmented(*side), (jax.random.split(key), sides))
+            labels = jnp.where(right, jnp.where(labels >= 0, labels + INSTANCES, labels), left_labels)
+        labels = jnp.where(of_target & (labels != MISSING), OTHER, labels)
+        return leave_out_smallest(labels, count, self.capacity)
+
+    def _segmented(
+        self, shelf: Shelf, points: Array, surface: Int[Array, "h w"], key: Array, objects: Bool[Array, "h w"]
+    ) -> Int[Array, "h w"]:
+        """Labels of the pixels of objects, whose `surface` is numbered."""
+        from mechsearch_jax.networks.segmentation import apply_network
+
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)), surface=surface.reshape(-1))
         output = apply_network(self.network, self.parameters, self._as_trained(shelf, cloud.points)[None])
         labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
-        image_labels = spread_labels(points, objects, cloud.points, labels)
-        return leave_out_smallest(jnp.where(of_target & (image_labels != MISSING), OTHER, image_labels))
+        return spread_labels(points, objects, cloud.points, labels)
 
     def _as_trained(self, shelf: Shelf, points: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
         """The points shifted as if the shelf stood where it stood in training, the only place the network knows."""

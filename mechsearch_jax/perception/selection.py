@@ -14,7 +14,7 @@ from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.images.cloud import above_board, draw
 from mechsearch_jax.images.labels import OTHER
-from mechsearch_jax.perception.hypotheses import SLOTS, WAYS
+from mechsearch_jax.perception.hypotheses import WAYS
 from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.refinement import FAR
 from mechsearch_jax.perception.solids import entries, penetrations, surface_distance
@@ -159,6 +159,7 @@ class Moves(PyTreeNode):
 
 
 def moves_of(
+    slots: int,
     chosen: Int[Array, " k"],
     divided: Bool[Array, " d"],
     pair: tuple[Array, Array],
@@ -168,6 +169,7 @@ def moves_of(
     """Divide a segment into two objects or one of them, join a pair, or drop an object; the target stays.
 
     Args:
+      slots: number of segments' objects.
       chosen: segments that are divided, each in `WAYS` ways.
       divided: which of the divisions are tried.
       pair: first and second segment of each union.
@@ -175,11 +177,11 @@ def moves_of(
       drops: whether objects are dropped.
     """
     count = len(divided)
-    capacity = SLOTS + 2 * count + len(joined) + 1
+    capacity = slots + 2 * count + len(joined) + 1
     of_segment = jax.nn.one_hot(jnp.repeat(chosen, WAYS), capacity, dtype=bool)
-    first, second = (jax.nn.one_hot(SLOTS + 2 * jnp.arange(count) + i, capacity, dtype=bool) for i in (0, 1))
-    merged = [jax.nn.one_hot(slots, capacity, dtype=bool) for slots in pair]
-    union = jax.nn.one_hot(SLOTS + 2 * count + jnp.arange(len(joined)), capacity, dtype=bool)
+    first, second = (jax.nn.one_hot(slots + 2 * jnp.arange(count) + i, capacity, dtype=bool) for i in (0, 1))
+    merged = [jax.nn.one_hot(each, capacity, dtype=bool) for each in pair]
+    union = jax.nn.one_hot(slots + 2 * count + jnp.arange(len(joined)), capacity, dtype=bool)
     each = jnp.eye(capacity, dtype=bool)[:-1]
     return Moves(
         removed=jnp.concatenate([of_segment, of_segment, of_segment, merged[0] | merged[1], each]),
@@ -202,7 +204,7 @@ class Selection(PyTreeNode):
 
 
 def select_objects(
-    scene: Superquadrics, moves: Moves, sample: Sample, pixels: Int[Array, " 8"], costs: Costs
+    scene: Superquadrics, moves: Moves, sample: Sample, pixels: Int[Array, " n"], costs: Costs
 ) -> Selection:
     """Which objects explain the image at the least cost, by the best change at a time from those of the segments.
 
@@ -212,14 +214,14 @@ def select_objects(
       pixels: of the segments.
       costs: static.
     """
-    capacity = scene.capacity
+    capacity, slots = scene.capacity, len(pixels)
     of_target = jnp.arange(capacity) == capacity - 1
     cost = jnp.where(scene.valid[:, None], point_cost(surface_distance(scene, sample.points), sample, costs), 1.0)
     price = jnp.where(of_target, 0.0, costs.object + passed(scene, sample, costs))
     overlap = costs.overlap_cost * 100.0 * jnp.maximum(penetrations(scene) - costs.overlap, 0.0)
 
     # What a change must gain, for those that begin with a segment.
-    size = jnp.concatenate([pixels, jnp.zeros(capacity - SLOTS)])
+    size = jnp.concatenate([pixels, jnp.zeros(capacity - slots)])
     needed = costs.gain + costs.gain_share * jnp.sum(moves.removed * size[None], axis=1)
     table = (cost, price, overlap, sample.weight)
 
@@ -227,8 +229,8 @@ def select_objects(
         after = (selected[None] & ~moves.removed) | (moves.added & scene.valid[None])
         possible = moves.possible & jnp.all(~moves.removed | selected[None], axis=1)
         possible &= jnp.all(~moves.added | scene.valid[None], axis=1)
-        possible &= jnp.sum(after & ~of_target[None], axis=1) <= SLOTS
-        block = 1 if on_cpu() else SLOTS
+        possible &= jnp.sum(after & ~of_target[None], axis=1) <= slots
+        block = 1 if on_cpu() else slots
         costs_after = masked_vmap(lambda _, table, row: _total(table, row), possible, None, table, after, block=block)
         return after, jnp.where(possible, present - costs_after, -jnp.inf)
 
@@ -241,10 +243,10 @@ def select_objects(
         selected = jnp.where(better, after[best], selected)
         return selected, jnp.where(better, present - gains[best], present), better, rounds + 1, margin, gains
 
-    start = scene.valid & ((jnp.arange(capacity) < SLOTS) | of_target)
+    start = scene.valid & ((jnp.arange(capacity) < slots) | of_target)
     unlimited, nothing = jnp.full(capacity, jnp.inf), jnp.full(len(needed), -jnp.inf)
     state = (start, _total(table, start), jnp.array(True), 0, unlimited, nothing)
-    selected, _, _, _, margin, gains = jax.lax.while_loop(lambda state: state[2] & (state[3] < SLOTS), step, state)
+    selected, _, _, _, margin, gains = jax.lax.while_loop(lambda state: state[2] & (state[3] < slots), step, state)
     left = jnp.min(jnp.where(moves.removed, -gains[:, None], jnp.inf), axis=0)
     return Selection(selected, jnp.minimum(margin, left))
 

@@ -13,6 +13,7 @@ from mechsearch_jax.config.config import OPTIONS, Config
 from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
+from mechsearch_jax.images.labels import CAPACITY, check_capacity
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
@@ -79,13 +80,15 @@ class Settings:
 
 # The keys of the target's table that are the workcell's `colour` and `hue_tolerance`; all others are of the `Target`.
 COLOUR, HUE_TOLERANCE = "colour", "hue_tolerance"
+# The key of the objects' table that is the workcell's.
+ROOM = "capacity"
 
 # The defaults of a file's tables, without the planner's.
 _PARTS: Mapping[str, Any] = {
     **{
         field.name: getattr(Workcell(), field.name)
         for field in dataclasses.fields(Workcell)
-        if field.name not in ("colour", "hue_tolerance", "camera_body", "obstacles")
+        if field.name not in ("colour", "hue_tolerance", "camera_body", "obstacles", ROOM)
     },
     "base": Base(),
     "objects": ObjectSizes(),
@@ -109,6 +112,7 @@ def tables() -> dict[str, dict[str, Any]]:
     parts["target"].pop("compound")
     parts["gripper"].pop("arm")
     parts["camera"][BODY] = Workcell().camera_body
+    parts["objects"][ROOM] = CAPACITY
     parts["target"] |= _MADE_OF | {COLOUR: Workcell().colour, HUE_TOLERANCE: Workcell().hue_tolerance}
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
@@ -139,6 +143,7 @@ def load_settings(path: PathLike) -> Settings:
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
     detector, document = _detector(document)
     body, document = _camera_body(document)
+    room, document = _room(document)
     base = with_table(document, "base", Base())
     x, y, z = base.position
     document = _with_moved_place(document, (-x, -y, -z))
@@ -155,7 +160,7 @@ def load_settings(path: PathLike) -> Settings:
         document,
         "target",
         {"inset": target.inset},
-        lambda given: Workcell(target=target if given else Target(), **detector, **parts),
+        lambda given: Workcell(target=target if given else Target(), **detector, **room, **parts),
     )
     bodied = lambda given: dataclasses.replace(workcell, camera_body=given.get(BODY, CAMERA_BODY))  # noqa: E731
     workcell = apply(document, "camera", body, bodied)
@@ -242,6 +247,14 @@ def _obstacle(document: Document, table: str) -> Obstacle:
         return apply(document, table, values, lambda changes: Obstacle.of_mesh(**{**changes, **needed}))
     usual = Obstacle("obstacle", (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
     return apply(document, table, values, lambda changes: dataclasses.replace(usual, **changes))
+
+
+def _room(document: Document) -> tuple[dict[str, int], Document]:
+    """How many objects the workcell has room for, and the document without it."""
+    rest = dict(document.tables.get("objects", {}))
+    given = {ROOM: checked(rest.pop(ROOM), int, document.where("objects", ROOM))} if ROOM in rest else {}
+    apply(document, "objects", given, lambda values: check_capacity(values.get(ROOM, CAPACITY)))
+    return given, dataclasses.replace(document, tables={**document.tables, "objects": rest})
 
 
 def _rgb(document: Document, value: Any) -> tuple[float, float, float]:

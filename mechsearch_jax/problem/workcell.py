@@ -8,6 +8,7 @@ from typing import Any
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.images.colour import HUE, RED, TargetColour
+from mechsearch_jax.images.labels import CAPACITY, check_capacity
 from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import PANDA, ArmConfig, ArmModel
@@ -36,6 +37,7 @@ class Workcell:
         shelf it is an obstacle, but not at the default pose, where the camera is simulated.
       obstacles: what else the arm keeps clear of. Decisions depend on it, and on the camera's body, only where the arm
         cannot execute one.
+      capacity: number of objects that recognition and planner can hold, 1 to 16.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -52,9 +54,11 @@ class Workcell:
     hue_tolerance: float = dataclasses.field(default=HUE, repr=False)
     camera_body: tuple[float, float, float] = dataclasses.field(default=CAMERA_BODY, repr=False)
     obstacles: tuple[Obstacle, ...] = dataclasses.field(default=(), repr=False)
+    capacity: int = dataclasses.field(default=CAPACITY, repr=False)
 
     def __post_init__(self):
         TargetColour.lit(self.colour, self.hue_tolerance)
+        check_capacity(self.capacity, "Workcell: capacity")
         # What plans is given the gripper, and with it the arm.
         if self.gripper.arm not in (PANDA, self.arm.arm):
             raise InputError(

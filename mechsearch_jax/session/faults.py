@@ -12,6 +12,7 @@ from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT
 from mechsearch_jax.images.checks import Look, check_images, hole_faults, unmeasured_target_faults
+from mechsearch_jax.images.labels import CAPACITY, more_room
 from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import lost_faults
@@ -57,7 +58,8 @@ def check_image(
     Raises:
       InputError: an image cannot be used, or the shelf is too far from where it should be.
     """
-    check_images(setting.camera, *images)
+    capacity = recogniser.core.capacity if isinstance(recogniser, Recogniser) else CAPACITY
+    check_images(setting.camera, *images, capacity=capacity)
     detector = recogniser.core.detector if isinstance(recogniser, Recogniser) and images.target_id is None else None
     look = Look(setting.camera, setting.shelf, images.depth, images.colour, images.mask, detector)
     faults = image_warnings(setting, recogniser, look, images.target_id)
@@ -141,4 +143,7 @@ def _crowd_warnings(observation: Observation) -> list[str]:
     slots = observation.objects.capacity
     if not bool(jnp.all(observation.objects.valid)):
         return []
-    return [f"recognition: all {slots} slots are taken, so that nothing else can be an object; see what lies on none"]
+    return [
+        f"recognition: all {slots} slots are taken, so that nothing else can be an object; see what lies on none"
+        f"{more_room(slots)}"
+    ]

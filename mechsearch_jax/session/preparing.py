@@ -20,15 +20,13 @@ import numpy as np
 from mechsearch_jax.actions import KINDS, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.policies import PlanningPolicy
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.own_settings import in_own_settings
-
-# Slots for objects in an observation.
-SLOTS = 8
 
 
 class Program(NamedTuple):
@@ -57,15 +55,16 @@ def program(name: str, function: Any, *args: Any) -> Program:
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))
 
 
-def nothing_seen(parts: int | None = None) -> Observation:
+def nothing_seen(parts: int | None = None, capacity: int = CAPACITY) -> Observation:
     """An observation of nothing, with the shapes of all others.
 
     Args:
       parts: room for parts of each body where bodies have parts, such as `geometry.bodies.PARTS`; None where they have
         none.
+      capacity: number of slots for objects.
     """
     shapes = jax.eval_shape(
-        lambda: Observation(empty(SLOTS, parts), jax.numpy.array(False), jax.numpy.zeros(3)).judged()
+        lambda: Observation(empty(capacity, parts), jax.numpy.array(False), jax.numpy.zeros(3)).judged()
     )
     return jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
 
@@ -84,9 +83,11 @@ def decision(problem: Problem, policy: Policy, seen: Observation | None = None) 
     return [*programs, program("belief", update_belief, problem, belief, seen, seen, no_action())]
 
 
-def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> list[Program]:
-    """The programs of the first decision and action that take long to compile, the longest first."""
-    return [*decision(problem, policy), *motions(motion)]
+def first_decision(
+    problem: Problem, policy: Policy, motion: MotionConfig, seen: Observation | None = None
+) -> list[Program]:
+    """The programs of the first decision and action that take long to compile, the longest first; see `decision`."""
+    return [*decision(problem, policy, seen), *motions(motion)]
 
 
 def retrieval(problem: Problem, policy: Policy, seen: Observation | None = None) -> list[Program]:

@@ -52,7 +52,7 @@ from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session import faults, warming
 from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
-from mechsearch_jax.session.preparing import first_decision, prepared
+from mechsearch_jax.session.preparing import first_decision, nothing_seen, prepared
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import Motion, Present, SearchStep, View, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, way_out
@@ -152,7 +152,7 @@ class Searcher:
     def recogniser(self) -> Any:
         """The recogniser of this search."""
         if self._make_recogniser is Recogniser:
-            return Recogniser(self.problem, detector=self.workcell.detector)
+            return Recogniser(self.problem, detector=self.workcell.detector, capacity=self.workcell.capacity)
         return self._make_recogniser(self.problem)
 
     @property
@@ -174,7 +174,7 @@ class Searcher:
     @in_own_settings
     def _now(self) -> State:
         if self._state is None:
-            self._state = beginning(self.problem)
+            self._state = beginning(self.problem, self.workcell.capacity)
         return self._state
 
     @in_own_settings
@@ -220,7 +220,8 @@ class Searcher:
         problem, key = self.problem, jax.random.key(0)
         images = warming.images(self.workcell.camera, self.workcell.shelf, colour, mask, target_id)
         config = self._trajectories.motion if self._trajectories else None
-        first = first_decision(problem, self._policy, motion_with(problem.gripper, config))
+        nothing = nothing_seen(capacity=self.workcell.capacity)
+        first = first_decision(problem, self._policy, motion_with(problem.gripper, config), nothing)
         # The longest programs are compiled in threads while the stages run, which wait for them where they call them.
         with prepared(first, lambda text: None):
             stage()
@@ -248,7 +249,7 @@ class Searcher:
         """A copy of this searcher at the beginning of its search, for which no recognition is too doubtful to move."""
         _ = self._view_warnings
         twin = copy.copy(self)
-        twin._state, twin._view = beginning(self.problem), None
+        twin._state, twin._view = beginning(self.problem, self.workcell.capacity), None
         twin._trajectories = dataclasses.replace(self._trajectories or TrajectoryConfig(), doubt=warming.TRUSTING)
         return twin
 
@@ -550,7 +551,7 @@ class Searcher:
           InputError: the file cannot be read, was not made by `save`, or belongs to another searcher, or to trials that
             learn of other hypotheses.
         """
-        state = load_state(self.problem, self._digest, path)
+        state = load_state(self.problem, self._digest, path, self.workcell.capacity)
         try:
             restored(self._trials, state.hypothesis_probabilities)
         except InputError as error:

@@ -16,12 +16,12 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief, initial_belief
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
-from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
 FORMAT = "mechsearch-search"
 VERSION = 2
@@ -90,7 +90,7 @@ def save_state(state: State, digest: str, path: PathLike) -> None:
         file.write(buffer.getvalue())
 
 
-def load_state(problem: Problem, digest: str, path: PathLike) -> State:
+def load_state(problem: Problem, digest: str, path: PathLike, capacity: int = CAPACITY) -> State:
     """Read a file of `save_state`.
 
     Raises:
@@ -109,20 +109,20 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
         raise InputError(
             f"{path}: is of another workcell, configuration or seed; make the Searcher as it was made then"
         )
-    like = beginning(problem)
+    like = beginning(problem, capacity)
     if "['observation'].confidence" not in arrays:
         # Saved before objects said how sure they are.
         like = dataclasses.replace(like, observation=like.observation.replace(confidence=None))
     if (size := arrays.get("['observation'].objects.parts.size")) is not None and size.ndim == 3:
-        objects = empty(MAX_OBJECTS, size.shape[1])
+        objects = empty(capacity, size.shape[1])
         like = dataclasses.replace(like, observation=like.observation.replace(objects=objects))
     state = _restored(like, arrays, rest, path)
     return dataclasses.replace(state, observation=state.observation.judged())
 
 
-def beginning(problem: Problem) -> State:
-    """The state before the first images."""
-    nothing = Observation(empty(MAX_OBJECTS), jnp.array(False), jnp.zeros(3)).judged()
+def beginning(problem: Problem, capacity: int = CAPACITY) -> State:
+    """The state before the first images, with so many slots for objects."""
+    nothing = Observation(empty(capacity), jnp.array(False), jnp.zeros(3)).judged()
     return State(0, initial_belief(problem), nothing, no_action(), handed=False, acted=False, finished=False)
 
 

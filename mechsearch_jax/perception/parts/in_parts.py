@@ -24,7 +24,6 @@ from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.perception.confidence import confidence_of
 from mechsearch_jax.perception.explanation import Fitted, Fitter, as_segmented
-from mechsearch_jax.perception.hypotheses import SLOTS
 from mechsearch_jax.perception.parts.divisions import Frame, frame_of, guesses, halves, in_frame
 from mechsearch_jax.perception.parts.joining import Joining, separate
 from mechsearch_jax.perception.parts.unions import (
@@ -137,7 +136,7 @@ def in_parts(
     base = fitted.objects
     eye = jnp.array(camera.position)
     noise = depth_noise(image, fitted.labels)
-    slots = jnp.arange(SLOTS)
+    slots = jnp.arange(base.capacity)
     evidence = jax.vmap(lambda slot: evidence_of(image, fitted.labels, slot, noise, camera, config))(slots)
     frames = jax.vmap(lambda body: frame_of(body, eye, jnp.float32(shelf.board)))(base)
     parts = jax.tree.map(lambda a: jnp.stack([a] * PARTS, axis=1), base)
@@ -173,12 +172,12 @@ def in_parts(
     confidence = jnp.where(several, confidence_of(measures), fitted.confidence)
     confidence = jnp.where(stands | ~base.valid, confidence, 0.0)
     joined = jnp.sum(of_body & base.valid[None], axis=1) != 1
-    of_object = (fitted.labels >= 0) & (fitted.labels < SLOTS)
+    of_object = (fitted.labels >= 0) & (fitted.labels < base.capacity)
     return fitted.replace(
         objects=_bodies(base.replace(valid=stands), parts, frames),
         measures=measures,
         confidence=confidence,
-        labels=jnp.where(of_object, owner[jnp.clip(fitted.labels, 0, SLOTS - 1)], fitted.labels).astype(
+        labels=jnp.where(of_object, owner[jnp.clip(fitted.labels, 0, base.capacity - 1)], fitted.labels).astype(
             fitted.labels.dtype
         ),
         changed=fitted.changed | (joined & base.valid),
@@ -191,7 +190,7 @@ def _each(function: Callable[..., Any], config: PartsConfig, active: Bool[Array,
     def run(_, element, row):
         return function(*row, config)
 
-    return masked_vmap(run, active, None, None, rows, block=1 if on_cpu() else SLOTS)
+    return masked_vmap(run, active, None, None, rows, block=1 if on_cpu() else len(active))
 
 
 def _where(mask: Bool[Array, " n"], a: Superquadrics, b: Superquadrics) -> Superquadrics:
@@ -317,7 +316,7 @@ def _refined(
 ) -> Superquadrics:
     """Shapes fitted to their points; those of few points, or of segments that are not active, are not valid."""
     camera, shelf, depth = scene
-    count = members.shape[1]
+    slots, count = members.shape[:2]
 
     def fit(shared, element, row):
         camera, shelf = shared
@@ -328,13 +327,13 @@ def _refined(
         return jax.tree.map(lambda a: a[0], refine(camera, shelf, one, points[segment], labels, depth, config).scene)
 
     flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (tried, members))
-    segment = jnp.repeat(jnp.arange(SLOTS), count)
+    segment = jnp.repeat(jnp.arange(slots), count)
     used = (jnp.sum(members, axis=-1) >= config.minimum_points) & tried.valid & active[:, None]
-    block = 1 if on_cpu() else SLOTS
+    block = 1 if on_cpu() else slots
     rows = (*flat, segment)
     fits = masked_vmap(fit, used.reshape(-1), (camera, shelf), (depth, evidence.points), rows, block=block)
     fits = fits.replace(size=jnp.where(used.reshape(-1, 1), fits.size, 0.01))
-    fits = jax.tree.map(lambda a: a.reshape(SLOTS, count, *a.shape[1:]), fits)
+    fits = jax.tree.map(lambda a: a.reshape(slots, count, *a.shape[1:]), fits)
     return fits.replace(valid=used & fits.valid & _fits_in(fits, shelf))
 
 

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.images.labels import OTHER
+from mechsearch_jax.images.labels import CAPACITY, OTHER
 from mechsearch_jax.perception.explanation import Fitted, Fitter, as_segmented
-from mechsearch_jax.perception.hypotheses import SLOTS, bordering, connected
+from mechsearch_jax.perception.hypotheses import bordering, connected
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import check_numbers
@@ -70,27 +70,29 @@ class Connected:
         refinement: RefinementConfig,
         least: Float[Array, ""] | float = 0.0,
     ) -> Fitted:
-        labels = connected_segments(image.points, image.labels, self.config, least)
+        labels = connected_segments(image.points, image.labels, self.config, least, image.capacity)
         return self.of(keys, image.replace(labels=labels), shapes, camera, shelf, target, refinement, least)
 
 
-@cached_jit(static_argnames=("config",))
+@cached_jit(static_argnames=("config", "capacity"))
 def connected_segments(
     points: Float[Array, "h w 3"],
     labels: Int[Array, "h w"],
     config: SegmentsConfig,
     least: Float[Array, ""] | float = 0.0,
+    capacity: int = CAPACITY,
 ) -> Int[Array, "h w"]:
     """Labels whose segments are cut where depth jumps, and joined where it does not.
 
-    Of more than eight the largest are kept; pixels of the others become OTHER. Approximation: two things that touch
-    without a jump in depth along a border of more than `config.border` pixels are taken for one.
+    Of more than `capacity` the largest are kept; pixels of the others become OTHER. Approximation: two things that
+    touch without a jump in depth along a border of more than `config.border` pixels are taken for one.
 
     Args:
       points: in the world [m].
       labels: as of `images.labels`.
       config: static.
       least: segments of at most so many pixels become OTHER, too.
+      capacity: static.
     """
     numbers = connected(points, labels, config.jump).reshape(-1)
     in_segment = (labels >= 0).reshape(-1)
@@ -115,8 +117,8 @@ def connected_segments(
 
     owner, _ = jax.lax.fori_loop(0, _PIECES - 1, join, (jnp.arange(_PIECES), borders + borders.T))
     total = jnp.zeros(_PIECES, jnp.int32).at[owner].add(sizes)
-    pixels, largest = jax.lax.top_k(total, SLOTS)
+    pixels, largest = jax.lax.top_k(total, capacity)
     enough = (pixels >= config.least) & (pixels > least)
-    slot_of = jnp.full(_PIECES, OTHER).at[largest].set(jnp.where(enough, jnp.arange(SLOTS), OTHER))
+    slot_of = jnp.full(_PIECES, OTHER).at[largest].set(jnp.where(enough, jnp.arange(capacity), OTHER))
     joined = jnp.where(pieces >= 0, slot_of[owner[jnp.maximum(pieces, 0)]], OTHER)
     return jnp.where(labels >= 0, joined.reshape(labels.shape), labels).astype(labels.dtype)
