@@ -195,9 +195,9 @@ def motion_of(
     if kind.code == ActionKind.NONE:
         if unseen:
             return Motion(nothing, "; ".join(unseen), None)
-        refused = int(decision.refused)
-        why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
-        return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
+        count = int(decision.refused)
+        why = f"each of the {count} best actions does harm as it is tried out; ask again, and others are drawn"
+        return Motion(nothing, f"{target}; {why if count else impasse(problem, belief, observation.objects)}", None)
     verb = kind.describe(decision.action, observation.objects.capacity)
 
     def refused(why: str) -> Motion:
