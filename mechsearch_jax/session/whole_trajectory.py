@@ -247,10 +247,13 @@ class _Assembly:
         if not follows or np.abs(q[0] - joints).max() > AT_REST:
             raise InputError("withdraw: the arm cannot follow a straight way out of the shelf; take it out by hand")
         q[0] = joints
-        body, shelf = ArmBody.of(width), Obstacles.of(self.problem.shelf, (), self.config.free.floor)
-        free = clearance(body, shelf, q).free
-        if free.min() < min(float(free[0]), 0.0) - NEARER:
-            raise InputError("withdraw: on a straight way out the arm would touch the shelf; take it out by hand")
+        body, known = ArmBody.of(width), self.config.obstacles
+        fixed = Obstacles.of(self.problem.shelf, (), self.config.free.floor, bodies=known)
+        each = clearance(body, fixed, q).each
+        touches = np.flatnonzero((each < np.minimum(each[:1], 0.0) - NEARER).any(axis=0))
+        if len(touches):
+            what = fixed.names[touches[0]]
+            raise InputError(f"withdraw: on a straight way out the arm would touch {what}; take it out by hand")
         # What is the same pose twice would have no direction.
         apart = np.concatenate([[True], np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-6])
         pace = self.speed * self.motion.carry_pace

@@ -6,6 +6,7 @@ A new one is a class and an entry in the registries here.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,7 @@ RIM, SECTIONS = 24, 32
 SHORTEST = 1e-6
 
 
-class Primitive:
+class Primitive(abc.ABC):
     """A family of convex solids with three half-extents, symmetric about the planes between their axes.
 
     Methods with a `library`, NumPy or `jax.numpy`, take and return its arrays; this folder does not import JAX, so that
@@ -46,32 +47,33 @@ class Primitive:
         """Why it cannot have three positive half-extents; None if it can."""
         return None
 
+    @abc.abstractmethod
     def volume(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
         """[m3]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def moments(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch 3"]:
         """Principal moments of inertia of a homogeneous solid of 1 kg [m2]."""
-        raise NotImplementedError
 
     def geometry_size(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch 3"]:
         """Size of its geometry in MuJoCo [m]."""
         return half_size
 
+    @abc.abstractmethod
     def bounding_radius(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
         """Radius of the smallest sphere about the centre that contains it [m]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def inside(self, point: Float[Any, "*batch 3"], half_size: Float[Any, " 3"], library: Any) -> Bool[Any, "*batch"]:
         """Whether points are in the solid [m]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def reach(
         self, direction: Float[Any, "*batch 3"], half_size: Float[Any, "*other 3"], library: Any
     ) -> Float[Any, "..."]:
         """Its support function, from its centre along unit vectors [m]; differentiable also along its axes."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def cut(
         self,
         origin: Sequence[Float[Any, "*#rays"]],
@@ -90,14 +92,14 @@ class Primitive:
         Returns:
           Distance from `origin` in lengths of `direction`.
         """
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def normal(
         self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
     ) -> Float[Any, "*batch 3"]:
         """Outward normals, of any length, at points on its surface, or at surface points near others [m]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def distance(
         self, level: Float[Any, "*batch 2"], height: Float[Any, "*batch"], half_size: Sequence[float], library: Any
     ) -> Float[Any, "*batch"]:
@@ -109,11 +111,10 @@ class Primitive:
           half_size: [m].
           library: of the arrays.
         """
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
         """Its surface as a triangle mesh [m]."""
-        raise NotImplementedError
 
 
 class Shape(Primitive):
@@ -139,6 +140,7 @@ class Shape(Primitive):
         """Half-extents of the solid of this shape nearest to a superquadric's half-extents [m]."""
         return size
 
+    @abc.abstractmethod
     def fall(self, before: Float[Any, "*batch 3"], after: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
         """Cosine of the angle by which it has fallen over; rolling does not count.
 
@@ -146,14 +148,14 @@ class Shape(Primitive):
           before, after: the world's vertical, as unit vectors.
           library: of the arrays.
         """
-        raise NotImplementedError
 
     # Points spread evenly over its surface, from the same random numbers for all shapes.
 
+    @abc.abstractmethod
     def areas(self, half_size: Float[Any, " 3"], library: Any) -> Float[Any, " 3"]:
         """Areas of three parts of its surface, relative to each other."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def spread(
         self, part: Int[Any, " n"], even: Float[Any, "n 3"], sign: Float[Any, " n"], library: Any
     ) -> Float[Any, "n 3"]:
@@ -165,14 +167,14 @@ class Shape(Primitive):
           sign: 1 or -1 with equal probability.
           library: of the arrays.
         """
-        raise NotImplementedError
 
     # On the host, for single bodies.
 
+    @abc.abstractmethod
     def rim(self, half_size: Sequence[float]) -> Float[np.ndarray, "corners 2"]:
         """A convex polygon around its level cross-section, counter-clockwise [m]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def grasps(
         self, half_size: Sequence[float], count: int, max_yaw: float
     ) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
@@ -183,7 +185,6 @@ class Shape(Primitive):
           count: number of approach directions of a round solid.
           max_yaw: their largest angle to its first axis [rad].
         """
-        raise NotImplementedError
 
 
 def slab(
