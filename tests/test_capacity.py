@@ -184,7 +184,7 @@ def test_trials_have_room_for_what_is_nearest_to_the_gripper():
 def test_a_decision_among_twelve_objects_is_made_and_tried(problem):
     """Its trials come to what those of the eight nearest objects alone come to."""
     placed = [
-        dataclasses.replace(body, position=(x, y, problem.shelf.board + body.half_size[2]))
+        dataclasses.replace(body, half_size=(*body.half_size[:2], 0.08), position=(x, y, problem.shelf.board + 0.08))
         for body, (x, y) in zip(
             BOXES, ((x, y) for x in (0.48, 0.58, 0.69) for y in (-0.14, 0.0, 0.14, 0.28)), strict=True
         )
