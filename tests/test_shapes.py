@@ -70,6 +70,9 @@ class Ball(Shape):
     def bounding_radius(self, half_size, library):
         return half_size[..., 0]
 
+    def inside(self, point, half_size, library):
+        return library.sum(point**2, axis=-1) < half_size[0] ** 2
+
     def reach(self, direction, half_size, library):
         return library.sqrt(library.sum(direction**2, axis=-1)) * half_size[..., 0]
 

@@ -114,8 +114,10 @@ class SearchStep:
         action, found = self.decision.action, bool(self.belief.found)
         kind, moves = kind_of(int(action.kind)), self.trajectory is not None
         possible = np.asarray(self.belief.exists)
+        # The way out of the shelf is no action.
+        what = self.kind if kind.code == ActionKind.NONE else kind.describe(action, objects.capacity)
         return Frame(
-            title=f"{self.index + 1}  {kind.describe(action, objects.capacity) if moves else 'nothing to be done'}",
+            title=f"{self.index + 1}  {what if moves else 'nothing to be done'}",
             caption=self.reason,
             image=self.image,
             owner=np.full(self.image.shape[:2], -1),
