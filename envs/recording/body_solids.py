@@ -13,7 +13,7 @@ from mechsearch_jax.envs.camera.simulated_camera import PALETTE
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of
 from mechsearch_jax.shapes import PRIMITIVES, in_order, union
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, faces, hull, solids, surface_points
-from mechsearch_jax.shapes.primitives import Primitive
+from mechsearch_jax.shapes.primitives import Surface
 from mechsearch_jax.viz.raycast import Colour, VisibleSolid
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Polyhedron(Primitive):
+class Polyhedron(Surface):
     """A convex polyhedron as a surface of pictures, whatever half-extents are said.
 
     Attributes:

@@ -27,11 +27,46 @@ RIM, SECTIONS = 24, 32
 SHORTEST = 1e-6
 
 
-class Primitive(abc.ABC):
-    """A family of convex solids with three half-extents, symmetric about the planes between their axes.
+class Surface(abc.ABC):
+    """The surface of a convex solid, as pictures show it.
 
     Methods with a `library`, NumPy or `jax.numpy`, take and return its arrays; this folder does not import JAX, so that
     the command line starts fast. Leading axes broadcast; directions and points are in the solid's frame.
+    """
+
+    @abc.abstractmethod
+    def cut(
+        self,
+        origin: Sequence[Float[Any, "*#rays"]],
+        direction: Sequence[Float[Any, "*#rays"]],
+        half_size: Float[Any, " 3"],
+        library: Any,
+    ) -> Float[Any, "*rays"]:
+        """Where rays from outside enter it; infinite for misses, also if it is behind them.
+
+        Args:
+          origin: of the rays, by component [m].
+          direction: of any length, by component.
+          half_size: [m].
+          library: of the arrays.
+
+        Returns:
+          Distance from `origin` in lengths of `direction`.
+        """
+
+    @abc.abstractmethod
+    def normal(
+        self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
+    ) -> Float[Any, "*batch 3"]:
+        """Outward normals, of any length, at points on its surface, or at surface points near others [m]."""
+
+    @abc.abstractmethod
+    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
+        """Its surface as a triangle mesh [m]."""
+
+
+class Primitive(Surface):
+    """A family of convex solids with three half-extents, symmetric about the planes between their axes.
 
     Attributes:
       code: its value among the kinds of pieces, and of a shape in `World.kind`; counted from 0.
@@ -74,32 +109,6 @@ class Primitive(abc.ABC):
         """Its support function, from its centre along unit vectors [m]; differentiable also along its axes."""
 
     @abc.abstractmethod
-    def cut(
-        self,
-        origin: Sequence[Float[Any, "*#rays"]],
-        direction: Sequence[Float[Any, "*#rays"]],
-        half_size: Float[Any, " 3"],
-        library: Any,
-    ) -> Float[Any, "*rays"]:
-        """Where rays from outside enter it; infinite for misses, also if it is behind them.
-
-        Args:
-          origin: of the rays, by component [m].
-          direction: of any length, by component.
-          half_size: [m].
-          library: of the arrays.
-
-        Returns:
-          Distance from `origin` in lengths of `direction`.
-        """
-
-    @abc.abstractmethod
-    def normal(
-        self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
-    ) -> Float[Any, "*batch 3"]:
-        """Outward normals, of any length, at points on its surface, or at surface points near others [m]."""
-
-    @abc.abstractmethod
     def distance(
         self, level: Float[Any, "*batch 2"], height: Float[Any, "*batch"], half_size: Sequence[float], library: Any
     ) -> Float[Any, "*batch"]:
@@ -111,10 +120,6 @@ class Primitive(abc.ABC):
           half_size: [m].
           library: of the arrays.
         """
-
-    @abc.abstractmethod
-    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
-        """Its surface as a triangle mesh [m]."""
 
 
 class Shape(Primitive):

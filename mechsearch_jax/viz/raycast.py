@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mechsearch_jax.shapes.primitives import Primitive
+from mechsearch_jax.shapes.primitives import Surface
 from mechsearch_jax.workspace.camera import Camera
 
 # A solid nearer to the camera's plane than this is cast in the whole image [m].
@@ -37,7 +37,7 @@ class VisibleSolid:
       colour: red, green and blue, 0 to 1.
     """
 
-    surface: Primitive
+    surface: Surface
     half_size: Float[np.ndarray, " 3"]
     rotation: Float[np.ndarray, "3 3"]
     position: Float[np.ndarray, " 3"]
