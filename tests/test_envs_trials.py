@@ -27,7 +27,6 @@ from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
-from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.grasping.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
@@ -489,11 +488,6 @@ def test_friction_and_mass(problem):
     for wrong in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="must be a positive number"):
             NativeTrials(friction=wrong)
-
-
-def test_more_objects_than_the_simulator_has_slots_for_are_refused(problem):
-    with pytest.raises(InputError, match="slots for 8 objects, not for 9"):
-        results_of(MODEL, problem, empty(9), jnp.zeros(3), False, stack(no_action()))
 
 
 def test_what_can_be_taken_out_is_and_where_nothing_can_the_search_goes_on(problem):

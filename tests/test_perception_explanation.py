@@ -216,6 +216,6 @@ def test_impossible_settings_are_refused():
         ExplanationConfig(gain=-1.0)
     with pytest.raises(InputError, match=r"wrong \(0.0\) must be positive"):
         ExplanationConfig(wrong=0.0)
-    with pytest.raises(InputError, match="at most 8"):
-        ExplanationConfig(splits=9)
+    with pytest.raises(InputError, match="at most 16"):
+        ExplanationConfig(splits=17)
     assert ExplanationConfig(splits=0, gain=0.0).splits == 0

@@ -426,9 +426,9 @@ def test_images_that_are_wrong_stay_wrong():
     assert (depth.dtype, colour.max(), mask.min() > 8) == (np.uint16, 255.0, True)
 
 
-def one_push(rollout, key, objects):
+def one_push(problem):
     """A plan of one push that the arm can make, which compiles in no time."""
-    grasps = rollout.problem.grasps
+    grasps = problem.grasps
     T = compose(grasps.T_world_target[grasps.pair_pose[0]], grasps.T_target_gripper[grasps.pair_grasp[0]])
     way = jnp.array([0.0, 0.05, 0.0])
     push = Action(
@@ -440,18 +440,23 @@ def one_push(rollout, key, objects):
         q7=grasps.q7[grasps.pair_grasp[0]],
         opening=jnp.float32(0.0),
     )
-    none = no_sequences(rollout.config, objects)
-    many = jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), push, none.actions)
-    value = jnp.zeros_like(none.value) + jax.random.uniform(key)
-    return Decision(
-        action=push,
-        value=value[0],
-        cost=jnp.float32(9.0),
-        predicted_cost=jnp.float32(8.0),
-        predicted=objects,
-        sequences=none.replace(actions=many, value=value),
-        refused=jnp.int32(0),
-    )
+    push = jax.tree.map(np.asarray, push)
+
+    def plan(rollout, key, objects):
+        none = no_sequences(rollout.config, objects)
+        many = jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), push, none.actions)
+        value = jnp.zeros_like(none.value) + jax.random.uniform(key)
+        return Decision(
+            action=jax.tree.map(jnp.asarray, push),
+            value=value[0],
+            cost=jnp.float32(9.0),
+            predicted_cost=jnp.float32(8.0),
+            predicted=objects,
+            sequences=none.replace(actions=many, value=value),
+            refused=jnp.int32(0),
+        )
+
+    return plan
 
 
 @pytest.mark.slow
@@ -459,7 +464,7 @@ def one_push(rollout, key, objects):
 def test_after_warming_up_nothing_is_compiled(problem, trials, monkeypatch):
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
     searcher = load_searcher(keep=False, trials=trials, sequences=4, horizon=1, trajectories=TRUSTING)
-    searcher.problem, searcher._policy = problem, searcher._policy.replace(plan=one_push)
+    searcher.problem, searcher._policy = problem, searcher._policy.replace(plan=one_push(problem))
     stages = []
     searcher.warm_up(lambda what, left: stages.append((what, left)))
     assert [left for _, left in stages] == [5, 4, 3, 2, 1, 0]
@@ -469,6 +474,11 @@ def test_after_warming_up_nothing_is_compiled(problem, trials, monkeypatch):
     step = share_step(problem.camera)
     measured = np.ones((problem.camera.height // step, problem.camera.width // step), np.float32)
     shown = [seen(scenario).replace(measured=measured) for scenario in (HIDDEN, OPEN)]
+    # In sight, but behind something wide that no hand reaches over.
+    wall = {"position": [0.5, 0.07, 0.49], "size": [0.01, 0.25, 0.085]}
+    objects = shown[1].objects
+    barred = objects.replace(**{k: getattr(objects, k).at[0].set(jnp.array(v)) for k, v in wall.items()})
+    shown.append(shown[1].replace(objects=barred))
     shown = [jax.device_put(jax.tree.map(np.asarray, there)) for there in shown]
     looks = [lambda *images, there=there: there for there in shown]
     with CompileClock() as clock:

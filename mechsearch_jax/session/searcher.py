@@ -35,7 +35,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.plausibility import EMPTY_SHELF, sight_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.learning import LearnedFriction, restored
-from mechsearch_jax.planner.policies import Policy
+from mechsearch_jax.planner.policies import PlanningPolicy, Policy
 from mechsearch_jax.planner.rollout import no_decision
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.step import Decided, SearchState, believe, decide, unsearched
@@ -52,7 +52,7 @@ from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session import faults, warming
 from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
-from mechsearch_jax.session.preparing import first_decision, nothing_seen, prepared
+from mechsearch_jax.session.preparing import Preparing, first_decision, nothing_seen, program
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import Motion, Present, SearchStep, View, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, way_out
@@ -223,12 +223,17 @@ class Searcher:
         nothing = nothing_seen(capacity=self.workcell.capacity)
         first = first_decision(problem, self._policy, motion_with(problem.gripper, config), nothing)
         # The longest programs are compiled in threads while the stages run, which wait for them where they call them.
-        with prepared(first, lambda text: None):
+        with Preparing(lambda text: None) as preparing:
+            preparing.add(first)
             stage()
             seen = jax.block_until_ready(self.recogniser(key, *images))
             hidden, visible = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
             stage()
             belief = jax.block_until_ready(believe(problem, unsearched(problem, hidden), hidden)).belief
+            if isinstance(self._policy, PlanningPolicy):
+                # Of a found target that cannot be taken out yet.
+                found = belief.replace(found=jax.numpy.array(True))
+                preparing.add([program("plan", self._policy, key, problem, found, visible)])
             stage()
             twin = self._twin()
             searching = twin._step_on(hidden, images)
