@@ -42,7 +42,7 @@ def cast(world, coarse=1):
     )
     normal = normal.reshape(-1, 3)
     distance = np.where(geom >= 0, distance, np.inf)
-    # mj_multiRay passes over parts of what spans a large angle (MuJoCo 3.17): still boxes are cast here, too.
+    # mj_multiRay passes through parts of a body of several boxes (MuJoCo 3.17): still boxes are cast here, too.
     for i in np.flatnonzero((world.model.geom_group == STILL) & (world.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)):
         _cast_box(world.data.geom_xpos[i], world.model.geom_size[i], unit.reshape(-1, 3), i, geom, distance, normal)
     depth = distance.reshape(shape) / length
