@@ -70,9 +70,7 @@ def root(decision, problem):
     @jax.jit
     def begin(problem, belief, objects):
         rollout = rollout_of(problem, belief)
-        state = rollout.root(objects)
-        state = rollout.update(state, state.moved)
-        return state.replace(candidates=rollout.candidates(state, state.moved))
+        return rollout.up_to_date(rollout.root(objects))
 
     return begin(problem, belief, objects)
 
@@ -170,7 +168,7 @@ def test_later_actions_are_drawn_in_the_predicted_scene(problem):
     _, objects = load("first-light")
     belief, shift = planner.initial_belief(problem), jnp.float32([0.0, 0.05, 0.0])
 
-    def draws_where_it_stands(key, problem, belief, objective, guided_fraction, state):
+    def draws_where_it_stands(key, problem, belief, objective, guided_fraction, state, wanted):
         T = jnp.eye(4).at[:3, 3].set(state.scene.position[0])
         action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), T_world_gripper=T)
         return Sample(action, jnp.int32(0))
@@ -184,10 +182,10 @@ def test_later_actions_are_drawn_in_the_predicted_scene(problem):
     class Drawn(Rollout):
         """What is drawn and predicted, and nothing computed of it."""
 
-        def update(self, state, moved):
+        def update(self, state):
             return state
 
-        def candidates(self, state, moved):
+        def candidates(self, state):
             return state.candidates
 
         def cost(self, state):
@@ -204,7 +202,7 @@ def test_later_actions_are_drawn_in_the_predicted_scene(problem):
 def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(problem, root):
     belief = planner.initial_belief(problem)
 
-    def counts(key, problem, belief, objective, guided_fraction, state):
+    def counts(key, problem, belief, objective, guided_fraction, state, wanted):
         return Sample(no_action().replace(q7=jax.random.uniform(key)), jnp.int32(0))
 
     def seldom(problem, state, sample, first):
@@ -214,7 +212,7 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         config = dataclasses.replace(CONFIG, **changes)
         rollout = Rollout(problem, belief, config, counts, seldom, POLICY.objective)
         keys = jax.random.split(jax.random.key(0), 4000)
-        alive = jax.vmap(lambda key: rollout.act(jnp.array(first), root, key)[0]["alive"])(keys)
+        alive = jax.vmap(lambda key: rollout.act(first, root, key)[0]["alive"])(keys)
         return float(jnp.mean(alive))
 
     for as_in_paper, first, later in ((False, 4, 1), (True, 8, 8)):
@@ -227,15 +225,15 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
     monkeypatch.setattr(rollouts, "on_cpu", lambda: on_cpu)
     rows, draws, rounds = 200, 4, []
 
-    def counts(key, problem, belief, objective, guided_fraction, state):
-        return Sample(no_action().replace(q7=jax.random.uniform(key)), jnp.int32(0))
+    def counts(key, problem, belief, objective, guided_fraction, state, wanted):
+        return Sample(no_action().replace(q7=jax.random.uniform(key), object=wanted.astype(jnp.int32)), jnp.int32(0))
 
-    def note(q7, movable, objects):
-        rounds.append((q7 < 0.3, movable, objects))
+    def note(q7, wanted):
+        rounds.append((q7 < 0.3, wanted == 1))
         return q7 < 0.3
 
     def seldom(problem, state, sample, first):
-        seen = (sample.action.q7, jnp.any(state.available), jnp.any(state.scene.valid))
+        seen = (sample.action.q7, sample.action.object)
         possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *seen, vmap_method="broadcast_all")
         return Prediction(state.scene, state.scene.valid, possible)
 
@@ -243,10 +241,9 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
     keys = jax.random.split(jax.random.key(0), rows)
     # The last is a sequence that has ended.
     states = repeated(root, rows).replace(alive=jnp.arange(rows) < rows - 1)
-    act = jax.jit(jax.vmap(lambda state, key: rollout.act(jnp.array(True), state, key)[0]["alive"]))
+    act = jax.jit(jax.vmap(lambda state, key: rollout.act(True, state, key)[0]["alive"]))
     acted = np.asarray(act(states, keys))
-    works, busy, objects = (np.stack(part) for part in zip(*rounds, strict=True))
-    np.testing.assert_array_equal(busy, objects)
+    works, busy = (np.stack(part) for part in zip(*rounds, strict=True))
     alive = np.asarray(states.alive)
     if on_cpu:
         # One after the other: only those go on that have no action yet.
@@ -460,8 +457,10 @@ def drawn(decision, root, problem):
     @jax.jit
     def draw(problem, belief, root, keys):
         def one(key):
-            sample = POLICY.propose(key, problem, belief, POLICY.objective, CONFIG.guided_fraction, root)
-            predict = lambda *shaky: foreseen(Shaky(*shaky))(problem, root, sample, jnp.array(True))  # noqa: E731
+            sample = POLICY.propose(
+                key, problem, belief, POLICY.objective, CONFIG.guided_fraction, root, jnp.array(True)
+            )
+            predict = lambda *shaky: foreseen(Shaky(*shaky))(problem, root, sample, True)  # noqa: E731
             prediction = jax.vmap(predict)(CHANCES, RESIDUALS)
             return sample, prediction.possible
 
@@ -479,7 +478,7 @@ def test_pushes_may_topple_what_they_move(drawn):
 
 
 def penalties_of(rollout, root, keys):
-    act = jax.jit(jax.vmap(lambda key: rollout.act(jnp.array(True), root, key)[2]))
+    act = jax.jit(jax.vmap(lambda key: rollout.act(True, root, key)[2]))
     return jax.device_get(act(keys))
 
 

@@ -71,12 +71,12 @@ def states(problem, belief, objects):
         propose=lambda *_: Sample(action, jnp.int32(0)),
         predict=lambda *_: Prediction(pushed, root.is_target, jnp.array(True)),
     )
-    changes, _, _ = moving.act(jnp.array(True), root, jax.random.key(0))
+    changes, _, _ = moving.act(True, root, jax.random.key(0))
 
     @jax.jit
     def evaluated(problem, belief, after):
         rollout = rollout_of(problem, belief)
-        after = rollout.update(after, after.scene.valid)
+        after = rollout.update(after.replace(moved=after.scene.valid))
         return after, rollout.cost(after)
 
     return root, *jax.device_get(evaluated(problem, belief, root.replace(**changes)))

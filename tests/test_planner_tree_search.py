@@ -40,10 +40,10 @@ class Line(Rollout):
 
     start: float = 0.0
 
-    def update(self, state, moved):
+    def update(self, state):
         return state
 
-    def candidates(self, state, moved):
+    def candidates(self, state):
         return state.candidates
 
     def cost(self, state):
@@ -51,7 +51,7 @@ class Line(Rollout):
         return jnp.asarray(COSTS)[jnp.clip(place + 2, 0, 4)]
 
 
-def to_either_side(key, problem, belief, objective, guided_fraction, state):
+def to_either_side(key, problem, belief, objective, guided_fraction, state, wanted):
     side = jnp.where(jax.random.bernoulli(key), STEP, -STEP)
     action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), displacement=jnp.array([0.0, 1.0, 0.0]) * side)
     return Sample(action, jnp.int32(0))

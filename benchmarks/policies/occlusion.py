@@ -107,7 +107,7 @@ def plan_by_occlusion(rollout: Rollout, key: Array, objects: Superquadrics) -> D
     count = rollout.config.sequences
     state = rollout.up_to_date(rollout.root(objects))
     occludes = occlusion(rollout.problem, rollout.belief, state)
-    changes, actions, _ = jax.vmap(lambda k: rollout.act(jnp.array(True), state, k))(jax.random.split(key, count))
+    changes, actions, _ = jax.vmap(lambda k: rollout.act(True, state, k))(jax.random.split(key, count))
     value = most_occluding_first(actions.kind, actions.object, occludes.by_object)
     usable = jnp.isfinite(value)
     actions = actions.replace(kind=jnp.where(usable, actions.kind, ActionKind.NONE).astype(jnp.int32))

@@ -66,7 +66,8 @@ def import_mctx() -> ModuleType:
 def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
     """The node that the action of an index leads to; an index always means the same action."""
     draw = jax.random.fold_in(jax.random.wrap_key_data(node.key), index)
-    changes, action, penalty = rollout.act(node.depth == 0, node.state, draw)
+    branches = (functools.partial(rollout.act, first) for first in (True, False))
+    changes, action, penalty = jax.lax.cond(node.depth == 0, *branches, node.state, draw)
     state = rollout.up_to_date(node.state.replace(**changes))
     return Node(
         state=state,

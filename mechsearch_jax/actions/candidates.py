@@ -233,6 +233,7 @@ def sample_action(
     all_candidates: AllCandidates,
     available: Bool[Array, "*kinds n"],
     weights: Float[Array, " n"] | None = None,
+    wanted: Bool[Array, ""] | bool = True,
 ) -> Sample:
     """Draw an action: object and kind (the multi-set of B.5) by the object's weight, then a candidate by its own.
 
@@ -244,6 +245,7 @@ def sample_action(
       all_candidates: the candidates of this scene.
       available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`.
       weights: sampling weights of the objects, positive; equal if left out, as in the paper.
+      wanted: whether the action is used; if not, it is of kind NONE, and little is computed.
     """
     n = scene.capacity
     key_choice, key_place = jax.random.split(key)
@@ -255,20 +257,19 @@ def sample_action(
     weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(free & ~enters, free, within)
     gumbel = _gumbel(key_choice, len(SAMPLED_KINDS), n, free.shape[1])
     choice, any_possible = _choose(weight.reshape(-1), gumbel.reshape(-1))
+    wanted = any_possible & wanted
     row, number = choice // free.shape[1], choice % free.shape[1]
     drawn_kind, index = row // n, row % n
 
     drafts = [
-        kind.draft(
-            key_place, space, scene, possible, c, DrawnCandidate(index, number, any_possible & (drawn_kind == i))
-        )
+        kind.draft(key_place, space, scene, possible, c, DrawnCandidate(index, number, wanted & (drawn_kind == i)))
         for i, (kind, c) in enumerate(zip(SAMPLED_KINDS, all_candidates, strict=True))
     ]
     draft = drafts[-1]
     for i in reversed(range(len(drafts) - 1)):
         draft = jax.tree.map(lambda a, b, i=i: jnp.where(drawn_kind == i, a, b), drafts[i], draft)
     executable, sample = draft
-    kind = jnp.where(any_possible & executable, sample.action.kind, ActionKind.NONE).astype(jnp.int32)
+    kind = jnp.where(wanted & executable, sample.action.kind, ActionKind.NONE).astype(jnp.int32)
     return sample.replace(action=sample.action.replace(kind=kind))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Protocol
 
 import jax
@@ -21,28 +20,16 @@ from mechsearch_jax.problem.problem import Problem
 class Predict(Protocol):
     """Predicts an action; static under jit."""
 
-    def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
+    def __call__(self, problem: Problem, state: State, sample: Sample, first: bool) -> Prediction:
         """The effect of an action; the scene stays unchanged if the action cannot be executed.
 
         Args:
           problem: constants of the search.
           state: the state before the action.
           sample: the action.
-          first: whether it is the first of its sequence.
+          first: whether it is the first of its sequence; static.
         """
         ...
-
-
-def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushModel:
-    """`model` if `first`, else `later`; only one of them runs unless `first` is batched."""
-    if model == later:
-        return model
-
-    def chosen(shelf, scene, pusher, T_world_gripper, displacement, q7):
-        branches = (functools.partial(model, shelf), functools.partial(later, shelf))
-        return jax.lax.cond(first, *branches, scene, pusher, T_world_gripper, displacement, q7)
-
-    return chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +46,8 @@ class PredictByKind:
     push_model: PushModel
     later_push_model: PushModel
 
-    def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
-        push_model = _either(first, self.push_model, self.later_push_model)
+    def __call__(self, problem: Problem, state: State, sample: Sample, first: bool) -> Prediction:
+        push_model = self.push_model if first else self.later_push_model
         action, scene = sample.action, state.scene
         # An action may move the target only as its own object.
         untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)

@@ -37,6 +37,7 @@ class Propose(Protocol):
         objective: Objective,
         guided_fraction: Array | float,
         state: State,
+        wanted: Bool[Array, ""],
     ) -> Sample:
         """One action, of kind NONE if none is possible.
 
@@ -47,6 +48,7 @@ class Propose(Protocol):
           objective: the cost that the search minimises.
           guided_fraction: see `PlannerConfig`.
           state: the state in which to sample.
+          wanted: whether the action is used; if not, it is of kind NONE, and little is computed.
         """
         ...
 
@@ -79,6 +81,7 @@ class WeightedDraw:
         objective: Objective,
         guided_fraction: Array | float,
         state: State,
+        wanted: Bool[Array, ""],
     ) -> Sample:
         """See `Propose`."""
         return sample_action(
@@ -89,6 +92,7 @@ class WeightedDraw:
             state.candidates,
             state.able,
             self.weigh(problem, belief, objective, guided_fraction, state),
+            wanted,
         )
 
 

@@ -35,8 +35,8 @@ from mechsearch_jax.problem.problem import Problem
 
 # Least decrease of J, as a share of J, that counts as a gain.
 GAIN = 0.02
-# Draws an action in a state and predicts it, given the number of the draw.
-Attempt = Callable[[State, Array], tuple[Sample, Prediction]]
+# Draws an action and predicts it, given the number of the draw and whether it counts.
+Attempt = Callable[[Array, Array], tuple[Sample, Prediction]]
 # Fields of a state that an action changes, or that are then computed for the next one.
 CHANGING = ("scene", "target_at", "moved", "available", "alive", "candidates")
 
@@ -121,9 +121,10 @@ class Rollout:
         """`present_state` of the rollout's problem and belief."""
         return present_state(self.problem, self.belief, objects, self.config)
 
-    def update(self, state: State, moved: Bool[Array, " n"]) -> State:
-        """Bring f and g of a state up to date after some objects moved."""
+    def update(self, state: State) -> State:
+        """Bring f and g of a state up to date after `state.moved` moved."""
         problem, settings, grasps = self.problem, self.problem.config.existence, self.belief.grasps
+        moved = state.moved
         objects = state.scene.replace(valid=state.scene.valid & ~state.is_target)
         if self.belief.exists.shape[-1] == 0:
             # Only the found pose counts; see `belief.without_candidates`.
@@ -146,39 +147,42 @@ class Rollout:
         hits_at_found = found_hits(problem.target_grasps, grasps, objects, at_found_pose, state.hits[rows:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, hits_at_found]))
 
-    def candidates(self, state: State, moved: Bool[Array, " n"]) -> AllCandidates:
-        """Candidate actions of a state, brought up to date after some objects moved."""
+    def candidates(self, state: State) -> AllCandidates:
+        """Candidate actions of a state, brought up to date after `state.moved` moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        return all_candidates(self.problem.space, state.scene, possible, state.candidates, moved, state.able)
+        return all_candidates(self.problem.space, state.scene, possible, state.candidates, state.moved, state.able)
 
     def up_to_date(self, state: State) -> State:
         """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
-        state = self.update(state, state.moved)
-        return state.replace(candidates=self.candidates(state, state.moved))
+        state = self.update(state)
+        return state.replace(candidates=self.candidates(state))
 
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
         return self.objective.cost(self.problem, self.belief, state, self.config.weights)
 
-    def _proposed(self, state: State, key: Array) -> Sample:
-        return self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, state)
-
-    def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
-        sample = self._proposed(state, key)
-        return sample, self.predict(self.problem, state, sample, first)
-
-    def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
+    def _draw(self, first: bool, state: State, key: Array) -> tuple[Sample, Prediction]:
         """An action and its prediction, drawn again until it is possible, at most as often as `config` allows."""
-        most, later = self.config.draws
-        draws = jnp.where(first, most, later)
-        attempt = lambda state, i: self._attempt(first, state, jax.random.fold_in(key, i))  # noqa: E731
-        if not on_cpu():
-            return _draw_all(attempt, state, draws, most)
-        shapes = jax.eval_shape(self._proposed, state, key)
-        return _draw_one_by_one(attempt, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), state, draws)
 
-    def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
-        """Sample an action in a state: the predicted changes, the action, and its penalties as shares of J, (2,)."""
+        def attempt(i, wanted):
+            draw = jax.random.fold_in(key, i)
+            guided = self.config.guided_fraction
+            sample = self.propose(draw, self.problem, self.belief, self.objective, guided, state, wanted)
+            return sample, self.predict(self.problem, state, sample, first)
+
+        draws = self.config.draws[0 if first else 1]
+        if draws == 1:
+            return attempt(jnp.int32(0), state.alive)
+        return _draw_one_by_one(attempt, state, key, draws) if on_cpu() else _draw_all(attempt, state, draws)
+
+    def act(self, first: bool, state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
+        """Sample an action in a state: the predicted changes, the action, and its penalties as shares of J, (2,).
+
+        Args:
+          first: whether it is the first of its sequence; static.
+          state: up to date.
+          key: PRNG key.
+        """
         sample, prediction = self._draw(first, state, key)
         acted = prediction.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
@@ -205,65 +209,59 @@ class Rollout:
         return contact_probability(self.problem.space, state.scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
-        """Advance all sequences by one action: the states after it, and records of the states before it."""
-        count = self.config.sequences
-        # All sequences begin in the same state, so only the first computes it.
-        first = time == 0
-        computes = (~first | (jnp.arange(count) == 0))[:, None]
-        moved = states.moved & computes
-        shared = lambda tree: jax.tree.map(lambda a: jnp.where(first, a[:1], a), tree)  # noqa: E731
-        states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
+        """Advance sequences that have begun by one action: the states after it, and records of the states before it."""
+        states = jax.vmap(self.update)(states)
 
         def act_all():
-            candidates = shared(jax.vmap(self.candidates)(states, moved))
-            act = jax.vmap(functools.partial(self.act, first))
-            changes, actions, penalty = act(states.replace(candidates=candidates), keys)
+            candidates = jax.vmap(self.candidates)(states)
+            now = states.replace(candidates=candidates)
+            changes, actions, penalty = jax.vmap(functools.partial(self.act, False))(now, keys)
             return changes | {"candidates": candidates}, actions, penalty
 
         def stay():
+            count = keys.shape[0]
             changes = {name: getattr(states, name) for name in CHANGING}
             return changes, repeated(no_action(), count), jnp.zeros((count, 2))
 
         # After the last action only the cost counts. Fields that actions do not change stay out of the branches.
         changes, actions, penalty = jax.lax.cond(time < self.config.horizon, act_all, stay)
-        kept = (actions, jax.vmap(self.cost)(states), penalty, changes["scene"])
+        kept = (actions, jax.vmap(self.cost)(states), penalty)
         return states.replace(**changes), kept
 
 
-def _emptied_unless(state: State, counts: Bool[Array, ""]) -> State:
-    """The state for an attempt; if the attempt does not count, without objects, so that it computes little."""
-    scene = state.scene.replace(valid=state.scene.valid & counts)
-    return state.replace(scene=scene, available=state.available & counts)
-
-
-def _draw_one_by_one(attempt: Attempt, blank: Sample, state: State, draws: Int[Array, ""]) -> tuple[Sample, Prediction]:
-    """The first possible attempt, without computing later ones: fastest on a CPU. `blank` is any sample."""
+def _draw_one_by_one(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[Sample, Prediction]:
+    """The first possible attempt, without computing later ones: fastest on a CPU."""
+    shapes = jax.eval_shape(lambda: attempt(jnp.int32(0), state.alive)[0])
+    blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
 
     def again(carry):
         i, (_, prediction) = carry
         # In a batch, sequences that have an action loop with the others.
-        return i + 1, attempt(_emptied_unless(state, state.alive & ~prediction.possible), i)
+        return i + 1, attempt(i, state.alive & ~prediction.possible)
 
     def goes_on(carry):
         i, (_, prediction) = carry
         return (i < draws) & ~prediction.possible & state.alive
 
-    # All that changes varies from sequence to sequence from the beginning: JAX would trace the loop once more to find
-    # that it does.
-    begin = (jnp.int32(0), (blank, nothing))
-    varying = jax.tree.map(lambda a: jnp.where(state.alive, a, a), begin)
-    return jax.lax.while_loop(goes_on, again, varying)[1]
+    # All that changes varies with the key from the beginning: JAX would trace the loop once more to find that it does.
+    either = jax.random.key_data(key)[0] == 0
+    begin = jax.tree.map(lambda a: jnp.where(either, a, a), (jnp.int32(0), (blank, nothing)))
+    return jax.lax.while_loop(goes_on, again, begin)[1]
 
 
-def _draw_all(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
+def _draw_all(attempt: Attempt, state: State, draws: int) -> tuple[Sample, Prediction]:
     """The first possible attempt, computing all at the same time: fastest on a GPU."""
-    number = jnp.arange(most, dtype=jnp.int32)
-
-    sample, prediction = jax.vmap(lambda i: attempt(_emptied_unless(state, state.alive & (i < draws)), i))(number)
-    possible = prediction.possible & (number < draws)
+    sample, prediction = jax.vmap(lambda i: attempt(i, state.alive))(jnp.arange(draws, dtype=jnp.int32))
+    possible = prediction.possible
     sample, prediction = jax.tree.map(lambda a: a[jnp.argmax(possible)], (sample, prediction))
     return sample, prediction.replace(possible=jnp.any(possible))
+
+
+def first_equal(tree: Any) -> Int[Array, " s"]:
+    """For each row of a pytree, the number of the first row that is equal to it."""
+    rows = jnp.concatenate([a.reshape(a.shape[0], -1).astype(jnp.float32) for a in jax.tree.leaves(tree)], axis=1)
+    return jnp.argmax(jnp.all(rows[:, None] == rows[None], axis=-1), axis=1)
 
 
 def repeated(tree: Any, count: int) -> Any:
@@ -284,17 +282,32 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     """
     config = rollout.config
     count, horizon = config.sequences, config.horizon
-    root = rollout.root(objects)
-    states = repeated(root, count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
-    _, (actions, cost, penalty, scenes) = jax.lax.scan(
-        lambda states, now: rollout.step(states, *now), states, (keys, jnp.arange(horizon + 1))
-    )
-    actions, penalty = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, penalty))
-    cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
+    # All sequences begin in the same state, which is computed once.
+    root = rollout.up_to_date(rollout.root(objects))
+    changes, actions, penalty = jax.vmap(functools.partial(rollout.act, True, root))(keys[0])
+    scenes = changes["scene"]
+    if horizon == 1:
+        # Pushes are often drawn again: of equal actions only the first is looked at.
+        first = first_equal(actions)
+        changes["moved"] &= (first == jnp.arange(count))[:, None]
+        after = jax.vmap(lambda changes: rollout.cost(rollout.update(root.replace(**changes))))(changes)[first]
+        actions, penalty, cost = jax.tree.map(lambda a: a[:, None], (actions, penalty, after))
+    else:
+        states = repeated(root, count).replace(**changes)
+        times = 1 + jnp.arange(horizon)
+        _, later = jax.lax.scan(lambda states, now: rollout.step(states, *now), states, (keys[1:], times))
+        later_actions, cost, later_penalty = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), later)
+        actions, penalty = jax.tree.map(
+            lambda a, b: jnp.concatenate([a[:, None], b[:, :-1]], axis=1),
+            (actions, penalty),
+            (later_actions, later_penalty),
+        )
+    now = rollout.cost(root)
+    cost = jnp.concatenate([jnp.broadcast_to(now, (count, 1)), cost], axis=1)
     value, length = sequence_values(cost, penalty * cost[:, :-1, None], actions.kind != ActionKind.NONE, config.gamma)
     # Without the target's slot, the last.
-    after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
+    after = jax.tree.map(lambda a: a[:, : objects.capacity], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)
     order = jnp.argsort(sequences.value, stable=True)
     sequences = jax.tree.map(lambda a: a[order], sequences)
