@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.geometry import collision, collision_kernel, masked, transforms
-from mechsearch_jax.geometry.collision import Clouds, clouds_of
+from mechsearch_jax.geometry.collision import Dense, clouds_of
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf, spheres_hit_shelf
@@ -122,18 +122,19 @@ def test_one_bad_entry_does_not_touch_the_others():
 # The ways in which a collision is decided: a CPU's loops with gauges at once and with bounds first, the same on a GPU
 # that has no kernel, and the kernel.
 WAYS = ("gauges", "bounds", "loops of a gpu", "kernel")
+# Points that the kernel tests at once.
+STEP = 32
 # The two that differ most.
 TWO_WAYS = ("bounds", pytest.param("kernel", marks=pytest.mark.slow))
 
 
-def compiled(way, *axes, own=False, first=0):
-    """`collisions` of (points, gap, cloud, poses, scene, mask) as one of the ways decides it, compiled.
+def compiled(way, *axes, own=False):
+    """`collisions` of (points, dense, cloud, poses, scene, mask) as one of the ways decides it, compiled.
 
     Args:
       way: one of `WAYS`.
       axes: `in_axes` of the batches that it is mapped over, from the inside.
       own: whether the clouds differ along a batch.
-      first: so many points are looked at first.
     """
 
     def run(*arguments):
@@ -142,20 +143,19 @@ def compiled(way, *axes, own=False, first=0):
                 patch.setattr(collision, "uses_kernel", lambda: True)
                 patch.setattr(collision, "collide", functools.partial(collision_kernel.collide, interpret=True))
                 # So few points at once, and so few programs, that there are several of both for each other.
-                patch.setattr(collision_kernel, "POINTS", 1 << (first - 1).bit_length() if first else 32)
+                patch.setattr(collision_kernel, "POINTS", STEP)
                 patch.setattr(collision_kernel, "PROGRAMS", 4)
             else:
                 # So few at once that there are several blocks.
-                for name, size in (("BOXES", 16), ("CLOUDS", 8), ("GAUGES", 4)):
+                for name, size in (("BOXES", 16), ("CLOUDS", 8), ("GROUPS", 16), ("GAUGES", 4)):
                     patch.setattr(collision, name, size)
                 patch.setattr(collision, "FEW", 1 << 30 if way == "gauges" else 0)
             if way == "loops of a gpu":
                 patch.setattr(masked, "on_cpu", lambda: False)
                 patch.setattr(masked, "GPU_BLOCKS", 2)
 
-            def decide(points, gap, cloud, T, scene, mask):
-                clouds = clouds_of(points)
-                clouds = Clouds(clouds.points, clouds.low, clouds.high, gap, first)
+            def decide(points, dense, cloud, T, scene, mask):
+                clouds = clouds_of(points).replace(dense=dense)
                 return collision.collisions(clouds, cloud, T, scene, mask, own)
 
             for along in axes:
@@ -166,9 +166,9 @@ def compiled(way, *axes, own=False, first=0):
 
 
 @functools.cache
-def decides(way, *axes, own=False, first=0):
+def decides(way, *axes, own=False):
     """`compiled`, once."""
-    return compiled(way, *axes, own=own, first=first)
+    return compiled(way, *axes, own=own)
 
 
 def rotations(rng, *shape):
@@ -226,7 +226,7 @@ def test_a_cloud_collides_where_the_minimum_of_equation_5_is_below_1(way, seed):
     rng = np.random.default_rng(seed)
     points, T, scene = random_clouds(rng), random_poses(rng), random_scene(rng)
     cloud, mask = np.int32(rng.integers(0, 4, 6)), rng.random((6, 4)) < 0.8
-    check(decides(way)(points, 0.0, cloud, T, scene, mask), least_of_equation_5(points, cloud, T, scene), mask)
+    check(decides(way)(points, None, cloud, T, scene, mask), least_of_equation_5(points, cloud, T, scene), mask)
 
 
 @pytest.mark.parametrize("way", TWO_WAYS)
@@ -237,35 +237,53 @@ def test_no_number_of_points_changes_what_is_found(way, points):
     cloud, mask = np.int32(rng.integers(0, 4, 40)), np.ones((40, 4), bool)
     least = least_of_equation_5(clouds, cloud, T, scene)
     assert 0 < np.sum(least < 1) < least.size
-    check(compiled(way)(clouds, 0.0, cloud, T, scene, mask), least, mask)
+    check(compiled(way)(clouds, None, cloud, T, scene, mask), least, mask)
 
 
 @pytest.mark.parametrize("way", WAYS)
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 10**6))
-def test_the_first_points_only_rule_out_what_no_other_point_can_hit(way, seed):
+def test_dense_clouds_are_tested_coarsely_and_in_groups_with_the_same_result(way, seed):
     rng = np.random.default_rng(seed)
     points, T, scene = random_clouds(rng), random_poses(rng), random_scene(rng)
-    cloud, mask, first = np.int32(rng.integers(0, 4, 6)), rng.random((6, 4)) < 0.8, 24
-    gap = max(scipy.spatial.KDTree(c.T[:first]).query(c.T)[0].max() for c in points)
-    got = decides(way, first=first)(points, np.float32(gap), cloud, T, scene, mask)
+    cloud, mask = np.int32(rng.integers(0, 4, 6)), rng.random((6, 4)) < 0.8
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collision, "GROUP", 8)
+        patch.setattr(collision, "STEP", STEP)
+        clouds = collision.dense_clouds(points.transpose(0, 2, 1), 24)
+    got = decides(way)(clouds.points, clouds.dense, cloud, T, scene, mask)
     check(got, least_of_equation_5(points, cloud, T, scene), mask)
+
+
+def test_groups_of_points_are_near_each_other_and_hold_all_of_them():
+    points = np.random.default_rng(0).uniform(-1, 1, (2, 1000, 3))
+    clouds = collision.dense_clouds(points, 100)
+    assert (clouds.points.shape, clouds.dense.groups.shape) == ((2, 3, 1024), (2, 16, 2, 3))
+    for cloud, ordered, boxes in zip(points, clouds.points, clouds.dense.groups, strict=True):
+        assert {tuple(p) for p in np.float32(cloud)} == {tuple(p) for p in ordered.T}
+        groups = ordered.T.reshape(16, 64, 3)
+        np.testing.assert_array_equal(boxes, np.stack([groups.min(axis=1), groups.max(axis=1)], axis=1))
+        # Sixteen boxes fill the cube: each has a sixteenth of it.
+        assert np.prod(np.diff(boxes, axis=1), axis=-1).mean() < 1.2 * 8 / 16
+    nearest = scipy.spatial.KDTree(points[1, :100]).query(points[1])[0].max()
+    assert clouds.dense.gap[1] == np.float32(nearest)
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("e", [0.2, 1.0, 1.9])
-def test_a_point_within_the_gap_of_the_first_ones_may_collide_and_none_beyond_it(way, e):
+def test_a_point_within_the_gap_of_the_coarse_ones_may_collide_and_none_beyond_it(way, e):
     scene = random_scene(np.random.default_rng(0), objects=1)
     scene = scene.replace(size=np.full((1, 3), 0.01, np.float32), exponents=np.full((1, 2), e, np.float32))
     scene = scene.replace(position=np.zeros((1, 3), np.float32), rotation=np.eye(3, dtype=np.float32)[None])
-    # The first point is outside, along the diagonal, where the p-norms differ most.
+    # The coarse point is outside, along the diagonal, where the p-norms differ most.
     points = np.zeros((1, 3, 2), np.float32)
     points[0, :, 0] = 0.03
-    find = decides(way, first=1)
+    boxes = np.float32([[[points[0].min(axis=1), points[0].max(axis=1)]]])
+    dense = lambda gap: Dense(points[..., :1], np.float32([gap]), boxes)  # noqa: E731
     arguments = np.zeros(1, np.int32), np.eye(4, dtype=np.float32)[None], scene, np.ones((1, 1), bool)
-    assert find(points, np.float32(0.03 * 3**0.5), *arguments).all()
-    # Not that it were true: what is said to be near the first point is not looked at.
-    assert not find(points, np.float32(0.0), *arguments).any()
+    assert decides(way)(points, dense(0.03 * 3**0.5), *arguments).all()
+    # Not that it were true: what is said to be near the coarse point is not looked at.
+    assert not decides(way)(points, dense(0.0), *arguments).any()
 
 
 @pytest.mark.parametrize("way", TWO_WAYS)
@@ -276,11 +294,11 @@ def test_a_batch_and_batches_of_batches_find_what_is_found_alone(way):
     least = least_of_equation_5(points, cloud, T, scene)
     assert 0.1 < np.mean(least < 1) < 0.9
     axes = (None, None, None, 0, 0, 0)
-    check(decides(way, axes, axes)(points, 0.0, cloud, T, scene, mask), least, mask)
+    check(decides(way, axes, axes)(points, None, cloud, T, scene, mask), least, mask)
     part = jax.tree.map(lambda a: a[0], (T, scene, mask))
-    check(decides(way, axes)(points, 0.0, cloud, *part), least[0], mask[0])
+    check(decides(way, axes)(points, None, cloud, *part), least[0], mask[0])
     part = jax.tree.map(lambda a: a[1, 2], (T, scene, mask))
-    check(decides(way)(points, 0.0, cloud, *part), least[1, 2], mask[1, 2])
+    check(decides(way)(points, None, cloud, *part), least[1, 2], mask[1, 2])
 
 
 @pytest.mark.parametrize("way", TWO_WAYS)
@@ -292,8 +310,8 @@ def test_clouds_may_differ_along_a_batch(way, own):
     cloud, mask = np.int32(rng.integers(0, 4, 6)), rng.random((3, 6, 4)) < 0.8
     least = least_of_equation_5(points, cloud, T, scene)
     axes = (0, None, None, 0, 0, 0)
-    check(decides(way, axes, own=own)(points, 0.0, cloud, T, scene, mask), least, mask)
-    alone = decides(way, own=own)(points[1], 0.0, cloud, T[1], jax.tree.map(lambda a: a[1], scene), mask[1])
+    check(decides(way, axes, own=own)(points, None, cloud, T, scene, mask), least, mask)
+    alone = decides(way, own=own)(points[1], None, cloud, T[1], jax.tree.map(lambda a: a[1], scene), mask[1])
     check(alone, least[1], mask[1])
 
 
@@ -328,7 +346,7 @@ def test_what_does_not_vary_along_an_axis_of_a_batch_is_the_same_along_it(way, v
         tuple(0 if name in names else None for name in ("c", "-", "-", "p", "s", "m")) for names in (inner, outer)
     )
     axes = [along for along in (within, around) if any(k is not None for k in along)]
-    got = decides(way, *axes, own=True)(points, 0.0, cloud, T, scene, mask)
+    got = decides(way, *axes, own=True)(points, None, cloud, T, scene, mask)
     whole_scene = jax.tree.map(lambda a: whole("s", a), scene)
     least = least_of_equation_5(whole("c", points), cloud, whole("p", T), whole_scene)
     wanted = whole("m", mask)
@@ -342,7 +360,7 @@ def test_masked_pairs_are_free_and_nothing_else_decides_where_all_are_inside(way
     scene = scene.replace(size=np.full((4, 3), 1.0, np.float32))
     points, T, cloud = random_clouds(rng), random_poses(rng), np.int32(rng.integers(0, 4, 6))
     for mask in (rng.random((6, 4)) < 0.5, np.zeros((6, 4), bool), np.ones((6, 4), bool)):
-        np.testing.assert_array_equal(decides(way)(points, 0.0, cloud, T, scene, mask), mask)
+        np.testing.assert_array_equal(decides(way)(points, None, cloud, T, scene, mask), mask)
 
 
 @pytest.mark.parametrize("way", TWO_WAYS)
@@ -352,7 +370,7 @@ def test_what_is_far_apart_does_not_collide_and_overflows_nothing(way, far):
     scene, T = random_scene(rng), random_poses(rng)
     T[:, 0, 3] += far
     scene = scene.replace(exponents=np.full((4, 2), 0.1, np.float32))
-    arguments = random_clouds(rng), 0.0, np.int32(rng.integers(0, 4, 6)), T, scene, np.ones((6, 4), bool)
+    arguments = random_clouds(rng), None, np.int32(rng.integers(0, 4, 6)), T, scene, np.ones((6, 4), bool)
     assert not decides(way)(*arguments).any()
 
 
@@ -361,7 +379,7 @@ def test_what_is_far_apart_does_not_collide_and_overflows_nothing(way, far):
 def test_where_there_is_nothing_nothing_collides(way, placed, objects):
     rng = np.random.default_rng(6)
     cloud = np.zeros(placed, np.int32)
-    arguments = random_clouds(rng), 0.0, cloud, random_poses(rng, placed=placed), random_scene(rng, objects=objects)
+    arguments = random_clouds(rng), None, cloud, random_poses(rng, placed=placed), random_scene(rng, objects=objects)
     assert compiled(way)(*arguments, np.ones((placed, objects), bool)).shape == (placed, objects)
 
 
@@ -374,7 +392,7 @@ def test_moving_clouds_and_objects_together_changes_nothing(way):
     moved = scene.replace(
         position=scene.position @ world[:3, :3].T + world[:3, 3], rotation=world[:3, :3] @ scene.rotation
     )
-    there = decides(way)(points, 0.0, cloud, np.float32(world @ T), moved, mask)
+    there = decides(way)(points, None, cloud, np.float32(world @ T), moved, mask)
     least = least_of_equation_5(points, cloud, T, scene)
     # A metre away, coordinates are known to a tenth of a micrometre.
     check(there, least, mask)
@@ -388,7 +406,7 @@ def test_all_other_clouds_are_where_they_are_whatever_one_number_is(way):
     cloud, mask = np.int32(rng.integers(0, 4, 6)), np.ones((6, 4), bool)
     lost = T.copy()
     lost[2] = np.nan
-    got, expected = (np.asarray(decides(way)(points, 0.0, cloud, pose, scene, mask)) for pose in (lost, T))
+    got, expected = (np.asarray(decides(way)(points, None, cloud, pose, scene, mask)) for pose in (lost, T))
     np.testing.assert_array_equal(np.delete(got, 2, axis=0), np.delete(expected, 2, axis=0))
 
 

@@ -43,7 +43,7 @@ def test_h_is_that_of_a_brute_force_reference(problem, objects, hits):
     T_target_gripper = np.asarray(tables.T_target_gripper)
     chosen = np.random.default_rng(0).choice(int(tables.pair_valid.sum()), 150, replace=False)
     for pair in chosen:
-        cloud = np.asarray(tables.clouds[grasp[pair]], np.float64).T
+        cloud = np.asarray(tables.swept.points[grasp[pair]], np.float64).T
         placed = T[pose[pair]].astype(np.float64) @ T_target_gripper[grasp[pair]].astype(np.float64)
         world = cloud @ placed[:3, :3].T + placed[:3, 3]
         for k in np.flatnonzero(objects.valid):

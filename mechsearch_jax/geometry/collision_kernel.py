@@ -1,10 +1,10 @@
 """Collision tests of point clouds with superquadrics on an NVIDIA GPU: one kernel for all pairs.
 
 A program of the kernel has a few placed clouds. For each it tests the masked objects one after the other: first the
-bounding boxes; if these overlap the first points of the cloud; and the other points only if the first ones are neither
-inside nor so far outside that no other can be inside. The masked objects and the colliding ones are the bits of a word
-for each placed cloud: few of the millions of clouds of a batch have a masked pair, and skipping the others must cost
-little.
+bounding boxes; if these overlap, points that cover the cloud evenly; and only if these are neither inside nor so far
+outside that no other can be inside, those groups of its points whose boxes overlap the object's. The masked objects
+and the colliding ones are the bits of a word for each placed cloud: few of the millions of clouds of a batch have a
+masked pair, and skipping the others must cost little.
 
 The gauge is computed with logarithms, where a power is a product and a p-norm of two numbers is
 
@@ -105,11 +105,10 @@ def collide(
     mask: Bool[Array, "*batch m n"],
     points: Array,
     boxes: Array,
-    gap: Array | float,
+    dense: Any,
     cloud: Array,
     T_world_cloud: Array,
     objects: Array,
-    first: int = 0,
     interpret: bool = False,
 ) -> Bool[Array, "*batch m n"]:
     """Which of the masked pairs collide.
@@ -118,11 +117,10 @@ def collide(
       mask: pairs of a placed cloud and an object.
       points: clouds as rows of coordinates in their own frames, shape (*batch, C, 3, P) [m].
       boxes: their least and largest coordinates, shape (*batch, C, 2, 3) [m].
-      gap: largest distance of a point from the nearest of the first `first` points of its cloud, shape () [m].
+      dense: `collision.Dense` of clouds of many points, or None.
       cloud: index of each placed cloud, shape (*batch, M).
       T_world_cloud: pose of each placed cloud, shape (*batch, M, 4, 4).
       objects: `T_object_world` (12 numbers), half-extents and exponents, shape (*batch, N, 17).
-      first: see `gap`; 0 if there is no `gap`. Static.
       interpret: run it as JAX operations on any device, slowly: for tests.
 
     An array that does not vary along a batch axis has a length of 1 there.
@@ -137,13 +135,17 @@ def collide(
     size = min(POINTS, pl.next_power_of_2(points.shape[-1]))
     placed = min(PLACED, pl.next_power_of_2(max(count * m // PROGRAMS, 1)))
     # Repeated points change no minimum.
-    points = jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, -points.shape[-1] % size)], mode="edge")
+    filled = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, -a.shape[-1] % size)], mode="edge")  # noqa: E731
+    points = filled(points)
     wanted = _packed(mask.reshape(count, m, n), m + -m % placed)
-    # With an infinite gap, the first points never rule out the others.
-    gaps = jnp.full((*boxes.shape[:-2], 1), gap if 0 < first <= size else jnp.inf, boxes.dtype)
-    boxes = jnp.concatenate([boxes.reshape(*boxes.shape[:-2], 6), gaps], axis=-1)
+    boxes = boxes.reshape(*boxes.shape[:-2], 6)
+    extra = []
+    if dense is not None:
+        steps = dense.groups.reshape(*dense.groups.shape[:-3], points.shape[-1] // size, -1, 2, 3)
+        steps = jnp.concatenate([jnp.min(steps[..., 0, :], axis=-2), jnp.max(steps[..., 1, :], axis=-2)], axis=-1)
+        extra = [filled(dense.coarse), dense.gap, steps]
     T = T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)
-    arrays = [points, boxes, cloud, T, objects]
+    arrays = [points, boxes, cloud, T, objects, *extra]
     settings = _Settings(
         batch=batch,
         shapes=tuple(a.shape[:lead] for a in arrays),
@@ -214,12 +216,13 @@ class _Settings(NamedTuple):
         return rows
 
 
-def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, objects, out) -> None:
+def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, objects, *refs) -> None:
     """One program: tests a few placed clouds of an element of the batch with the objects of a word. Arrays are refs."""
     from jax.experimental import pallas as pl
 
+    *dense, out = refs
     b, w, first = pl.program_id(1), pl.program_id(2), pl.program_id(0) * settings.placed
-    in_points, in_boxes, in_cloud, in_T, in_objects = settings.rows(b)
+    in_points, in_boxes, in_cloud, in_T, in_objects, *in_dense = settings.rows(b)
     rows = pl.ds(first, settings.placed)
     out[b, w, rows] = jnp.zeros(settings.placed, jnp.int32)
 
@@ -231,14 +234,15 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
         def _():
             c = cloud[in_cloud, i]
             T = [[T_world_cloud[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
-            box, gap = [boxes[in_boxes, c, k] for k in range(6)], boxes[in_boxes, c, 6]
+            box = [boxes[in_boxes, c, k] for k in range(6)]
+            of_cloud = _Cloud(points, in_points, c, *zip(dense, in_dense, strict=True))
 
             def at_boxes(bit, hits):
                 numbers = [objects[in_objects, w * BITS + bit, k] for k in range(17)]
                 relative = _relative(numbers, T)
 
                 def at_points(hits):
-                    hit = _inside(settings, points, in_points, c, gap, relative, numbers[12:])
+                    hit = _inside(settings, of_cloud, relative, numbers[12:])
                     return hits | jax.lax.shift_left(hit.astype(jnp.int32), bit)
 
                 return jax.lax.cond(_boxes_overlap(relative, numbers[12:15], box), at_points, lambda hits: hits, hits)
@@ -256,33 +260,57 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
         jax.lax.fori_loop(0, settings.placed, at_cloud, 0)
 
 
-def _inside(
-    settings: _Settings, points, row, cloud, gap: Array, relative: Sequence[Sequence[Array]], shape: Sequence[Array]
-) -> Array:
+class _Cloud(NamedTuple):
+    """A cloud of the kernel's arrays, which are refs.
+
+    Attributes:
+      points, row, number: its points are `points[row, number]`.
+      coarse, gap, steps: of `Dense`, each with its row: points that cover the cloud, their gap, and boxes around its
+        points of each step; None for a cloud of few points.
+    """
+
+    points: Any
+    row: Any
+    number: Any
+    coarse: tuple[Any, Any] | None = None
+    gap: tuple[Any, Any] | None = None
+    steps: tuple[Any, Any] | None = None
+
+
+def _inside(settings: _Settings, cloud: _Cloud, relative: Sequence[Sequence[Array]], shape: Sequence[Array]) -> Array:
     """Whether a point of a cloud is inside an object, given by half-extents and exponents."""
     from jax.experimental import pallas as pl
 
     rows = [[number / shape[k] for number in relative[k]] for k in range(3)]
     powers = [2.0 / shape[4], 2.0 / shape[3], 0.5 * shape[4], 0.5 * shape[3]]
+    size, c = settings.size, cloud.number
 
-    def least_of(k):
-        x, y, z = (points[row, cloud, axis, pl.ds(k * settings.size, settings.size)] for axis in range(3))
+    def least_of(points, row, k):
+        x, y, z = (points[row, c, axis, pl.ds(k * size, size)] for axis in range(3))
         scaled = [r[0] * x + (r[1] * y + (r[2] * z + r[3])) for r in rows]
-        return log_gauge(scaled, powers, settings.log2, settings.exp2)
+        return jnp.min(log_gauge(scaled, powers, settings.log2, settings.exp2))
 
-    def other_points(_):
-        least = jax.lax.fori_loop(
-            1,
-            points.shape[-1] // settings.size,
-            lambda k, least: jnp.minimum(least, least_of(k)),
-            jnp.full(settings.size, jnp.inf, jnp.float32),
-        )
-        return (jnp.min(least) < 0.0).astype(jnp.int32)
+    def any_step(_):
+        def step(k, hit):
+            near = hit == 0
+            if cloud.steps is not None:
+                boxes, row = cloud.steps
+                near &= _boxes_overlap(relative, shape[:3], [boxes[row, c, k, i] for i in range(6)])
+            tested = lambda _: (least_of(cloud.points, cloud.row, k) < 0.0).astype(jnp.int32)  # noqa: E731
+            return jax.lax.cond(near, tested, lambda hit: hit, hit)
 
-    least = jnp.min(least_of(0))
+        return jax.lax.fori_loop(0, cloud.points.shape[-1] // size, step, jnp.int32(0))
+
+    if cloud.coarse is None or cloud.gap is None:
+        return any_step(0) > 0
+    (coarse, row), (gaps, gap_row) = cloud.coarse, cloud.gap
+    least = least_of(coarse, row, 0)
+    for k in range(1, coarse.shape[-1] // size):
+        least = jnp.minimum(least, least_of(coarse, row, k))
+    gap = gaps[gap_row, c]
     # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
     reach = jnp.where(jnp.maximum(shape[3], shape[4]) > 1.0, 2.0 * gap, gap)
     beyond = reach / jnp.minimum(jnp.minimum(shape[0], shape[1]), shape[2])
     inside = least < 0.0
     settled = inside | (jnp.exp2(least) > 1.0 + ROUNDING + beyond)
-    return jax.lax.cond(settled, lambda hit: hit, other_points, inside.astype(jnp.int32)) > 0
+    return jax.lax.cond(settled, lambda hit: hit, any_step, inside.astype(jnp.int32)) > 0

@@ -141,7 +141,7 @@ def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carr
     return jax.lax.fori_loop(jnp.uint32(0), blocks, step, carry)
 
 
-def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[[Array, Any, Any], Any]:
+def merged(run: Callable[[Array, Any, Any], Any], indices: float = 1.0) -> Callable[[Array, Any, Any], Any]:
     """A function of a mask (n,), a shared pytree and rows, which is called for a whole batch at once under `vmap`.
 
     Args:
@@ -162,7 +162,7 @@ def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[
     def merge(axis_size, in_batched, mask, shared, rows):
         mask_batched, shared_batched, rows_batched = in_batched
         mask = mask if mask_batched else jnp.broadcast_to(mask, (axis_size, *mask.shape))
-        limit = LARGEST_INDEX // max(mask.size // axis_size * indices, 1)
+        limit = int(LARGEST_INDEX / max(mask.size // axis_size * indices, 1))
         piece = max((k for k in range(1, axis_size + 1) if axis_size % k == 0 and k <= limit), default=1)
 
         def spread(a, batched):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
+from mechsearch_jax.geometry.collision import Clouds, collisions, dense_clouds
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
 from mechsearch_jax.grasping.antipodal import WRISTS, antipodal_grasps
@@ -39,7 +39,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 from mechsearch_jax.workspace.target_view import swept_target
 
-# Number of points of a cloud that are tested first.
+# Number of points of a swept cloud that cover it coarsely.
 COARSE = 256
 # Number of hits that a pose without a feasible grasp counts for: one more than the eight objects of a scene and its
 # target, for any number of slots.
@@ -61,28 +61,18 @@ class GraspTables(PyTreeNode):
       q7: angle of joint 7 in each grasp [rad], shape (G,).
       wrist: index of the wrist's swept gripper cloud, shape (G,).
       ahead: least cosine of the angle between the approach and +x, seen from above, shape (G,).
-      clouds: points that gripper and target sweep in each grasp, in the gripper's frame, shape (G, 3, P).
-      low, high: bounding box of each cloud, shape (G, 3) [m].
+      swept: the G clouds of points that gripper and target sweep in each grasp, in the gripper's frame.
       still_gripper: points on the open gripper with each wrist, in its own frame, shape (W, 3, S).
       still_target: surface of the target in its own frame, shape (3, R).
-      gap: largest distance of a point of a cloud from the nearest of its first `COARSE` points [m].
     """
 
     T_target_gripper: jax.Array
     q7: jax.Array
     wrist: jax.Array
     ahead: jax.Array
-    clouds: jax.Array
-    low: jax.Array
-    high: jax.Array
+    swept: Clouds
     still_gripper: jax.Array
     still_target: jax.Array
-    gap: jax.Array
-
-    @property
-    def swept(self) -> Clouds:
-        """The clouds."""
-        return Clouds(self.clouds, self.low, self.high, self.gap, COARSE)
 
 
 class CandidateGrasps(GraspTables):
@@ -178,7 +168,7 @@ def feasible_grasps(
     ahead &= active
 
     ways = WaysIn(T.reshape(-1, 4, 4), jnp.tile(tables.q7, n), np.tile(np.arange(g), n))
-    return gripper_enters(shelf, gripper, config.waypoints, tables.clouds, ways, ahead.reshape(-1)).reshape(n, g)
+    return gripper_enters(shelf, gripper, config.waypoints, tables.swept.points, ways, ahead.reshape(-1)).reshape(n, g)
 
 
 def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> GraspTables:
@@ -198,7 +188,7 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     # Every leading part of a cloud covers gripper and target evenly.
     progress = [np.arange(n) / n for n in (config.points, config.target_points)]
     order = np.argsort(np.concatenate(progress), kind="stable")
-    clouds, low, high = [], [], []
+    clouds = []
     # Grasps that differ only in their wrists take the target out in the same direction.
     directions = {d.tobytes(): d for d in outward}
     swept_targets = {
@@ -207,12 +197,9 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     }
     for T, w, direction in list(zip(np.asarray(T_target_gripper), wrist, outward, strict=True))[:count]:
         inside = (swept_targets[direction.tobytes()] - T[:3, 3]) @ T[:3, :3]
-        both = np.concatenate([swept[w], inside])
-        clouds.append(both[order].T)
-        low.append(both.min(axis=0))
-        high.append(both.max(axis=0))
-    for rows in (clouds, low, high):
-        rows += [rows[-1]] * (len(wrist) - count)
+        clouds.append(np.concatenate([swept[w], inside])[order])
+    of_grasps = dense_clouds(np.stack(clouds), COARSE)
+    filled = np.minimum(np.arange(len(wrist)), count - 1)
     still_target = swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion)
     fields = {
         "T_target_gripper": T_target_gripper,
@@ -220,12 +207,9 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
         "wrist": np.int32(wrist),
         # Approaches at the limit count.
         "ahead": np.full(len(wrist), math.cos(config.max_yaw + 1e-4), np.float32),
-        "clouds": np.float32(np.stack(clouds)),
-        "low": np.float32(np.stack(low)),
-        "high": np.float32(np.stack(high)),
+        "swept": jax.tree.map(lambda a: a[filled], of_grasps),
         "still_gripper": np.float32(np.stack([cloud.T for cloud in still])),
         "still_target": np.float32(still_target.T),
-        "gap": np.float32(max(gap_of(cloud.T, COARSE) for cloud in clouds[:count])),
     }
     return GraspTables(**jax.device_put(fields))
 

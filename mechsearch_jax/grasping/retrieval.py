@@ -130,7 +130,7 @@ def can_be_joined(sets: Sequence[TargetGrasps]) -> bool:
 
     def tested(one: TargetGrasps) -> tuple[Any, ...]:
         tables, config = one.tables, one.config
-        shapes = tables.clouds.shape[1:], tables.still_gripper.shape[1:], tables.still_target.shape
+        shapes = tables.swept.points.shape[1:], tables.still_gripper.shape[1:], tables.still_target.shape
         return config.waypoints, shapes
 
     return len({tested(one) for one in sets}) == 1
@@ -148,12 +148,11 @@ def joined(sets: Sequence[TargetGrasps]) -> TargetGrasps:
     # Each set has its own wrists.
     before = np.cumsum([0, *(len(table.still_gripper) for table in tables)])
     fields: dict[str, Any] = {
-        name: jnp.concatenate([getattr(table, name) for table in tables])
-        for name in ("T_target_gripper", "q7", "ahead", "clouds", "low", "high", "still_gripper")
+        name: jax.tree.map(lambda *a: jnp.concatenate(a), *(getattr(table, name) for table in tables))
+        for name in ("T_target_gripper", "q7", "ahead", "swept", "still_gripper")
     }
     wrist = jnp.concatenate([table.wrist + np.int32(start) for table, start in zip(tables, before, strict=False)])
-    gap = jnp.max(jnp.stack([jnp.asarray(table.gap) for table in tables]))
-    return first.replace(tables=GraspTables(**fields, wrist=wrist, still_target=tables[0].still_target, gap=gap))
+    return first.replace(tables=GraspTables(**fields, wrist=wrist, still_target=tables[0].still_target))
 
 
 def no_grasps(grasps: TargetGrasps) -> FoundGrasps:

@@ -7,7 +7,6 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.types import Prediction, Sample

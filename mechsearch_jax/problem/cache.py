@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import operator
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ import numpy as np
 from mechsearch_jax.actions.config import ActionTables
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceTables
+from mechsearch_jax.geometry.collision import Clouds, Dense
 from mechsearch_jax.grasping.graspability import CandidateGrasps, GraspTables
 from mechsearch_jax.problem import problem as problems
 from mechsearch_jax.problem.problem import Problem
@@ -24,6 +28,7 @@ from mechsearch_jax.runtime.compiled import keep_in
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.kept_arrays import cache_folder, forget_old, load_arrays, save_arrays
 from mechsearch_jax.runtime.own_settings import in_own_settings
+from mechsearch_jax.runtime.pytree import PyTreeNode
 from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -33,7 +38,9 @@ from mechsearch_jax.workspace.target import Target
 # So many built problems are kept, for users who switch between versions of the package.
 CACHED_PROBLEMS = 6
 
-_TABLES = {"existence": ExistenceTables, "grasps": CandidateGrasps, "actions": ActionTables, "retrieval": GraspTables}
+# The tables of a problem, and those within them.
+_PARTS = {"existence": ExistenceTables, "grasps": CandidateGrasps, "actions": ActionTables, "retrieval": GraspTables}
+_TABLES: Mapping[str, Any] = {**_PARTS, "swept": Clouds, "dense": Dense}
 _ARRAYS = ("poses", "cell")
 
 
@@ -136,9 +143,24 @@ def _key(parts: dict[str, Any]) -> str:
 
 def _save(problem: Problem, file: Path, key: str) -> None:
     arrays = {name: np.asarray(getattr(problem, name)) for name in _ARRAYS}
-    for table in _TABLES:
-        arrays |= {f"{table}.{name}": np.asarray(value) for name, value in vars(getattr(problem, table)).items()}
+    for table in _PARTS:
+        arrays |= _named(getattr(problem, table), table)
     save_arrays(arrays, file, key)
+
+
+def _named(value: Any, name: str) -> dict[str, np.ndarray]:
+    """The arrays of a table and of the tables in it, by names such as "grasps.swept.points"."""
+    if not isinstance(value, PyTreeNode):
+        return {name: np.asarray(value)}
+    return functools.reduce(operator.or_, (_named(part, f"{name}.{field}") for field, part in vars(value).items()))
+
+
+def _table(name: str, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The inverse of `_named`."""
+    if name in arrays:
+        return jax.device_put(arrays[name])
+    kind = _TABLES[name.rpartition(".")[2]]
+    return kind(**{field.name: _table(f"{name}.{field.name}", arrays) for field in dataclasses.fields(kind)})
 
 
 def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
@@ -148,10 +170,6 @@ def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
         return None
     try:
         places = {name: jax.device_put(arrays.pop(name)) for name in _ARRAYS}
-        fields: dict[str, dict[str, jax.Array]] = {table: {} for table in _TABLES}
-        for name, array in arrays.items():
-            table, field = name.split(".")
-            fields[table][field] = jax.device_put(array)
-        return Problem(**places, **{table: kind(**fields[table]) for table, kind in _TABLES.items()}, **parts)
+        return Problem(**places, **{name: _table(name, arrays) for name in _PARTS}, **parts)
     except (ValueError, KeyError, TypeError):
         return None

@@ -115,7 +115,7 @@ def _tests(
 
     T_world_target = upright_pose(poses, target.height(shelf))
     T = compose(T_world_target[:, None], tables.T_target_gripper[None])
-    return jax.vmap(jax.vmap(tested), (0, None, None))(T, tables.q7, tables.clouds)
+    return jax.vmap(jax.vmap(tested), (0, None, None))(T, tables.q7, tables.swept.points)
 
 
 def bands(rows: Sequence[ReachRow], width: float = 0.05) -> list[dict[str, Any]]:
