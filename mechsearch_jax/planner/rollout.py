@@ -173,7 +173,7 @@ class Rollout:
         draws = self.config.draws[0 if first else 1]
         if draws == 1:
             return attempt(jnp.int32(0), state.alive)
-        return _draw_one_by_one(attempt, state, key, draws) if on_cpu() else _draw_all(attempt, state, draws)
+        return (_draw_one_by_one if on_cpu() else _draw_all)(attempt, state, key, draws)
 
     def act(self, first: bool, state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
         """Sample an action in a state: the predicted changes, the action, and its penalties as shares of J, (2,).
@@ -231,9 +231,6 @@ class Rollout:
 
 def _draw_one_by_one(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[Sample, Prediction]:
     """The first possible attempt, without computing later ones: fastest on a CPU."""
-    shapes = jax.eval_shape(lambda: attempt(jnp.int32(0), state.alive)[0])
-    blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-    nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
 
     def again(carry):
         i, (_, prediction) = carry
@@ -244,18 +241,35 @@ def _draw_one_by_one(attempt: Attempt, state: State, key: Array, draws: int) -> 
         i, (_, prediction) = carry
         return (i < draws) & ~prediction.possible & state.alive
 
+    return jax.lax.while_loop(goes_on, again, _begin(attempt, state, key))[1]
+
+
+def _draw_all(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[Sample, Prediction]:
+    """The first possible attempt in two rounds, the first attempt and then all others: fastest on a GPU."""
+    others = jnp.arange(draws - 1, dtype=jnp.int32)
+
+    def again(carry):
+        turn, (_, prediction) = carry
+        wanted = state.alive & ~prediction.possible & ((turn > 0) | (others == 0))
+        drawn = jax.vmap(attempt)(others + turn, wanted)
+        first = jnp.argmax(drawn[1].possible)
+        return turn + 1, jax.tree.map(lambda new, old: jnp.where(prediction.possible, old, new[first]), drawn, carry[1])
+
+    def goes_on(carry):
+        turn, (_, prediction) = carry
+        return (turn < 2) & ~prediction.possible & state.alive
+
+    return jax.lax.while_loop(goes_on, again, _begin(attempt, state, key))[1]
+
+
+def _begin(attempt: Attempt, state: State, key: Array) -> tuple[Array, tuple[Sample, Prediction]]:
+    """What loops over attempts begin with: no attempt yet."""
+    shapes = jax.eval_shape(lambda: attempt(jnp.int32(0), state.alive)[0])
+    blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
     # All that changes varies with the key from the beginning: JAX would trace the loop once more to find that it does.
     either = jax.random.key_data(key)[0] == 0
-    begin = jax.tree.map(lambda a: jnp.where(either, a, a), (jnp.int32(0), (blank, nothing)))
-    return jax.lax.while_loop(goes_on, again, begin)[1]
-
-
-def _draw_all(attempt: Attempt, state: State, draws: int) -> tuple[Sample, Prediction]:
-    """The first possible attempt, computing all at the same time: fastest on a GPU."""
-    sample, prediction = jax.vmap(lambda i: attempt(i, state.alive))(jnp.arange(draws, dtype=jnp.int32))
-    possible = prediction.possible
-    sample, prediction = jax.tree.map(lambda a: a[jnp.argmax(possible)], (sample, prediction))
-    return sample, prediction.replace(possible=jnp.any(possible))
+    return jax.tree.map(lambda a: jnp.where(either, a, a), (jnp.int32(0), (blank, nothing)))
 
 
 def first_equal(tree: Any) -> Int[Array, " s"]:

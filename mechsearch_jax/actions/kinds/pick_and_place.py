@@ -28,10 +28,13 @@ from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.rigid import held_pose, pick_and_place
 from mechsearch_jax.geometry.bodies import slimmed
 from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
 
 CODE = 2
+# Drafts that are computed together on a CPU.
+DRAFTS = 32
 
 
 def _object_hits(T, owner, held, scene, clouds, distance, mask):
@@ -115,7 +118,20 @@ class PickAndPlace(SampledKind):
         """The grasp, a place where the object can be put, and the poses of gripper and object at both ends."""
         index, number = drawn.object, jnp.clip(drawn.number, 0, candidates.reached.shape[1] - 1)
         T, wrist = candidates.T_world_gripper[index, number], jnp.asarray(self.wrists(space))[number]
-        placed, T_place, T_object = placement(key, space, scene, possible, ObjectGrasp(index, T, wrist, drawn.wanted))
+        grasp, data, rng = (
+            ObjectGrasp(index, T, wrist, drawn.wanted),
+            jax.random.key_data(key),
+            jax.random.key_impl(key),
+        )
+
+        def place(space, element, _):
+            data, scene, possible, grasp = element
+            return placement(jax.random.wrap_key_data(data, impl=rng), space, scene, possible, grasp)
+
+        # Of a batch of drafts only those that are wanted are computed.
+        element = data, scene, possible, grasp
+        placed, T_place, T_object = masked_vmap(place, drawn.wanted[None], space, element, None, block=DRAFTS)
+        placed, T_place, T_object = placed[0], T_place[0], T_object[0]
         action = Action(
             kind=jnp.int32(CODE),
             object=index.astype(jnp.int32),

@@ -51,6 +51,8 @@ from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf, past_open_si
 # A push within these angles of +x or -x starts behind the object, any other beside it [rad].
 BEHIND = (math.radians(75), math.radians(45))
 CODE = 1
+# Pushes that are predicted together on a CPU.
+PUSHES = 32
 # Number of places along a push that are tested for collision.
 PUSH_PLACES = 3
 # Least distance of a pushed object's centre from the front edge [m].
@@ -436,8 +438,26 @@ class Push(SampledKind):
         Nothing of a stack is touched: push models predict what slides on the board, and are not shown what stands on
         something. What is moved must not end within its circle around what stands on something, as seen from above.
         """
+
+        def predicted(space, element, _):
+            return self._predicted(space, push_model, *element)
+
+        # Of a batch of actions only the pushes are predicted.
+        pushes, element = action.kind == CODE, (scene, untouchable, action, wrist)
+        return jax.tree.map(lambda a: a[0], masked_vmap(predicted, pushes[None], space, element, None, block=PUSHES))
+
+    def _predicted(
+        self,
+        space: ActionSpace,
+        push_model: PushModel,
+        scene: Superquadrics,
+        untouchable: Bool[Array, " n"],
+        action: Action,
+        wrist: Int[Array, ""],
+    ) -> Prediction:
+        """`predict` of a push."""
         pushes = action.kind == CODE
-        # A push model that simulates has less to do where nothing is pushed.
+        # Of a block that is not full, a push model that simulates has less to do.
         displacement = jnp.where(pushes, action.displacement, 0.0)
         prints = footprints(scene)
         carries, aloft = stacks(space, prints)
