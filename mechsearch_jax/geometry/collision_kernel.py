@@ -154,6 +154,7 @@ def collide(
         size=size,
         log2=jnp.log2 if interpret else special("lg2"),
         exp2=jnp.exp2 if interpret else special("ex2"),
+        sqrt=jnp.sqrt if interpret else special("sqrt"),
     )
     hits = pl.pallas_call(
         functools.partial(_kernel, settings),
@@ -193,7 +194,7 @@ class _Settings(NamedTuple):
       objects: number of objects.
       placed: number of placed clouds of a program.
       size: points in one step.
-      log2, exp2: of base 2.
+      log2, exp2, sqrt: the last two bits of their results may be wrong.
     """
 
     batch: tuple[int, ...]
@@ -203,6 +204,7 @@ class _Settings(NamedTuple):
     size: int
     log2: Function
     exp2: Function
+    sqrt: Function
 
     def rows(self, element: Array) -> list[Any]:
         """The row of each array that belongs to an element of the batch."""
@@ -283,34 +285,52 @@ def _inside(settings: _Settings, cloud: _Cloud, relative: Sequence[Sequence[Arra
 
     rows = [[number / shape[k] for number in relative[k]] for k in range(3)]
     powers = [2.0 / shape[4], 2.0 / shape[3], 0.5 * shape[4], 0.5 * shape[3]]
+    roots = [jnp.exp2(0.5 * shape[4]), jnp.exp2(0.5 * shape[3])]
     size, c = settings.size, cloud.number
 
-    def least_of(points, row, k):
+    def scaled(points, row, k):
         x, y, z = (points[row, c, axis, pl.ds(k * size, size)] for axis in range(3))
-        scaled = [r[0] * x + (r[1] * y + (r[2] * z + r[3])) for r in rows]
-        return jnp.min(log_gauge(scaled, powers, settings.log2, settings.exp2))
+        return [jnp.abs(r[0] * x + (r[1] * y + (r[2] * z + r[3]))) for r in rows]
 
-    def any_step(_):
+    def bounds(point):
+        """Bounds on the least gauge without logarithms; see `collision._bounds`."""
+        x, y, z = point
+        p = jnp.broadcast_to(powers[0], x.shape)
+        most, two = jnp.maximum(x, y), settings.sqrt(x * x + y * y)
+        below = jnp.where(p > 2.0, most, two)
+        above = jnp.where(p >= 2.0, jnp.minimum(two, roots[0] * most), x + y)
+        return jnp.min(jnp.maximum(below, z)), jnp.min(jnp.maximum(above, z)) * roots[1]
+
+    def hit_by(point):
+        return (jnp.min(log_gauge(point, powers, settings.log2, settings.exp2)) < 0.0).astype(jnp.int32)
+
+    def in_step(k):
+        point = scaled(cloud.points, cloud.row, k)
+        least, most = bounds(point)
+        surely = (most < 1.0).astype(jnp.int32)
+        return jax.lax.cond((least < 1.0) & (surely == 0), lambda _: hit_by(point), lambda hit: hit, surely)
+
+    def in_steps(_):
         def step(k, hit):
             near = hit == 0
             if cloud.steps is not None:
                 boxes, row = cloud.steps
                 near &= _boxes_overlap(relative, shape[:3], [boxes[row, c, k, i] for i in range(6)])
-            tested = lambda _: (least_of(cloud.points, cloud.row, k) < 0.0).astype(jnp.int32)  # noqa: E731
-            return jax.lax.cond(near, tested, lambda hit: hit, hit)
+            return jax.lax.cond(near, lambda _: in_step(k), lambda hit: hit, hit)
 
         return jax.lax.fori_loop(0, cloud.points.shape[-1] // size, step, jnp.int32(0))
 
     if cloud.coarse is None or cloud.gap is None:
-        return any_step(0) > 0
+        return in_steps(0) > 0
     (coarse, row), (gaps, gap_row) = cloud.coarse, cloud.gap
-    least = least_of(coarse, row, 0)
+    least, most = bounds(scaled(coarse, row, 0))
     for k in range(1, coarse.shape[-1] // size):
-        least = jnp.minimum(least, least_of(coarse, row, k))
+        more = bounds(scaled(coarse, row, k))
+        least, most = jnp.minimum(least, more[0]), jnp.minimum(most, more[1])
     gap = gaps[gap_row, c]
     # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
     reach = jnp.where(jnp.maximum(shape[3], shape[4]) > 1.0, 2.0 * gap, gap)
     beyond = reach / jnp.minimum(jnp.minimum(shape[0], shape[1]), shape[2])
-    inside = least < 0.0
-    settled = inside | (jnp.exp2(least) > 1.0 + ROUNDING + beyond)
-    return jax.lax.cond(settled, lambda hit: hit, any_step, inside.astype(jnp.int32)) > 0
+    inside = most < 1.0
+    settled = inside | (least > 1.0 + ROUNDING + beyond)
+    return jax.lax.cond(settled, lambda hit: hit, in_steps, inside.astype(jnp.int32)) > 0

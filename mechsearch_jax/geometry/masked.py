@@ -215,6 +215,8 @@ def masked_vmap(
             return _everywhere(function, mask, shared, per_element, rows)
         width = jnp.uint32(n)
 
+        # Traced once, for the shape of its results and in the loop.
+        @jax.jit
         def evaluate(shared, per_element, rows, index):
             entry = entry_of(index, batch, n)
             row = jax.tree.map(lambda a: entry.of(a, (jax.lax.rem(index, width), n)), rows)
@@ -226,7 +228,9 @@ def masked_vmap(
             values = evaluate(shared, per_element, rows, jax.lax.min(index, jnp.uint32(total - 1)))
             return jax.tree.map(lambda r, v: put(r, index, v), result, values)
 
-        shape = jax.eval_shape(evaluate, shared, per_element, rows, jax.ShapeDtypeStruct((1,), jnp.uint32))
+        shape = jax.eval_shape(
+            evaluate, shared, per_element, rows, jax.ShapeDtypeStruct((min(size, total),), jnp.uint32)
+        )
         result = jax.tree.map(lambda s: jnp.zeros((total, *s.shape[1:]), s.dtype), shape)
         result = for_each(mask.reshape(-1), body, result, size)
         return jax.tree.map(lambda r: r.reshape(*mask.shape, *r.shape[1:]), result)
