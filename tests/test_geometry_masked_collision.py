@@ -257,7 +257,7 @@ def test_dense_clouds_are_tested_coarsely_and_in_groups_with_the_same_result(way
 
 def test_groups_of_points_are_near_each_other_and_hold_all_of_them():
     points = np.random.default_rng(0).uniform(-1, 1, (2, 1000, 3))
-    clouds = collision.dense_clouds(points, 100)
+    clouds = jax.device_get(collision.dense_clouds(points, 100))
     assert (clouds.points.shape, clouds.dense.groups.shape) == ((2, 3, 1024), (2, 16, 2, 3))
     for cloud, ordered, boxes in zip(points, clouds.points, clouds.dense.groups, strict=True):
         assert {tuple(p) for p in np.float32(cloud)} == {tuple(p) for p in ordered.T}

@@ -24,15 +24,15 @@ from mechsearch_jax.workspace.target import Target
 # a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found; those of
 # scenes with room for bodies of several parts; and, by a little, those for a target of pieces.
 BUDGET = {
-    ("cpu", "hidden"): (16_400, 58),
-    ("cpu", "found"): (18_100, 74),
-    ("gpu", "hidden"): (18_400, 73),
-    ("gpu", "found"): (20_000, 91),
-    ("cpu", "hidden", "parts"): (35_000, 94),
-    ("gpu", "found", "parts"): (37_600, 109),
-    ("cpu", "found", "pieces"): (18_200, 74),
+    ("cpu", "hidden"): (19_500, 77),
+    ("cpu", "found"): (23_100, 113),
+    ("gpu", "hidden"): (20_400, 81),
+    ("gpu", "found"): (23_700, 121),
+    ("cpu", "hidden", "parts"): (38_400, 111),
+    ("gpu", "found", "parts"): (41_800, 140),
+    ("cpu", "found", "pieces"): (23_200, 113),
     # Outside of batches a target that actions leave where it is has no candidate poses.
-    ("cpu", "found", "alone"): (16_100, 61),
+    ("cpu", "found", "alone"): (18_900, 83),
 }
 PIECES = Piece("cylinder", (0.03, 0.03, 0.05)), Piece("box", (0.02, 0.005, 0.03), (0.04, 0.0, 0.0))
 # Versions of JAX write the same program with a few equations and loops more or less.

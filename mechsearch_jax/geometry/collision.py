@@ -82,8 +82,8 @@ def dense_clouds(points: Float[np.ndarray, "c p 3"], coarse: int) -> Clouds:
     groups = ordered.reshape(*ordered.shape[:2], -1, GROUP)
     boxes = np.stack([groups.min(axis=-1), groups.max(axis=-1)], axis=1).transpose(0, 3, 1, 2)
     first = points[:, :coarse].transpose(0, 2, 1)
-    dense = Dense(*(np.float32(a) for a in (first, gap, boxes)))
-    return Clouds(*(np.float32(a) for a in (ordered, ordered.min(axis=-1), ordered.max(axis=-1))), dense)
+    dense = Dense(*(jnp.asarray(a, jnp.float32) for a in (first, np.array(gap), boxes)))
+    return clouds_of(jnp.asarray(ordered, jnp.float32)).replace(dense=dense)
 
 
 def _grouped(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:

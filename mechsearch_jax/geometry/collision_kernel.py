@@ -39,7 +39,7 @@ ROUNDING = 1e-4
 POINTS, WARPS = 256, 2
 # Largest number of placed clouds of a program, a power of 2, and the number of programs below which it is smaller. A
 # GPU begins a program in about a nanosecond, and one with fewer placed clouds is done sooner.
-PLACED, PROGRAMS = 16, 2**17
+PLACED, PROGRAMS = 64, 2**17
 # Objects whose bits share a word.
 BITS = 32
 
@@ -149,7 +149,6 @@ def collide(
     settings = _Settings(
         batch=batch,
         shapes=tuple(a.shape[:lead] for a in arrays),
-        objects=n,
         placed=placed,
         size=size,
         log2=jnp.log2 if interpret else special("lg2"),
@@ -191,7 +190,6 @@ class _Settings(NamedTuple):
     Attributes:
       batch: sizes of the batch axes.
       shapes: the same of each array, 1 where it does not vary along an axis.
-      objects: number of objects.
       placed: number of placed clouds of a program.
       size: points in one step.
       log2, exp2, sqrt: the last two bits of their results may be wrong.
@@ -199,7 +197,6 @@ class _Settings(NamedTuple):
 
     batch: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
-    objects: int
     placed: int
     size: int
     log2: Function
@@ -239,6 +236,14 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
             box = [boxes[in_boxes, c, k] for k in range(6)]
             of_cloud = _Cloud(points, in_points, c, *zip(dense, in_dense, strict=True))
 
+            def at_object(rest):
+                rest, hits = rest
+                lowest = rest & -rest
+                # The number of the only bit that is set, from the exponent of its float.
+                value = jnp.abs(lowest.astype(jnp.float32))
+                bit = jax.lax.shift_right_logical(jax.lax.bitcast_convert_type(value, jnp.int32), 23) - 127
+                return rest ^ lowest, at_boxes(bit, hits)
+
             def at_boxes(bit, hits):
                 numbers = [objects[in_objects, w * BITS + bit, k] for k in range(17)]
                 relative = _relative(numbers, T)
@@ -249,11 +254,7 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
 
                 return jax.lax.cond(_boxes_overlap(relative, numbers[12:15], box), at_points, lambda hits: hits, hits)
 
-            def at_object(bit, hits):
-                is_wanted = jax.lax.shift_right_logical(word, bit) & 1 != 0
-                return jax.lax.cond(is_wanted, functools.partial(at_boxes, bit), lambda hits: hits, hits)
-
-            out[b, w, i] = jax.lax.fori_loop(0, min(settings.objects, BITS), at_object, jnp.int32(0))
+            out[b, w, i] = jax.lax.while_loop(lambda rest: rest[0] != 0, at_object, (word, jnp.int32(0)))[1]
 
         return 0
 
