@@ -253,10 +253,11 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
         np.testing.assert_array_equal(busy[1:], alive & ~has_action[:-1])
         assert 0 < busy[-1].sum() < busy[0].sum() / 2
     else:
-        # All at once, in a single call.
-        works, busy = works[0], busy[0]
-        np.testing.assert_array_equal(busy, np.repeat(alive[:, None], draws, axis=1))
-        has_action = np.cumsum(works, axis=1).T > 0
+        # The first, and then all others at once.
+        first, others = works[0][:, 0], works[1]
+        np.testing.assert_array_equal(busy[0], alive[:, None] & [True, False, False])
+        np.testing.assert_array_equal(busy[1], np.repeat((alive & ~first)[:, None], draws - 1, axis=1))
+        has_action = [first | others.any(axis=1)]
     np.testing.assert_array_equal(acted, has_action[-1] & alive)
 
 

@@ -251,7 +251,8 @@ def _draw_all(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[S
     def again(carry):
         turn, (_, prediction) = carry
         wanted = state.alive & ~prediction.possible & ((turn > 0) | (others == 0))
-        drawn = jax.vmap(attempt)(others + turn, wanted)
+        sample, predicted = jax.vmap(attempt)(others + turn, wanted)
+        drawn = sample, predicted.replace(possible=predicted.possible & wanted)
         first = jnp.argmax(drawn[1].possible)
         return turn + 1, jax.tree.map(lambda new, old: jnp.where(prediction.possible, old, new[first]), drawn, carry[1])
 
