@@ -24,7 +24,9 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.bodies import surfaces
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, matmul, transform
+from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.compiled import cached_jit
 
 # Smaller displacements of an object's centre are noise of recognition, or cannot move a target to another cell [m].
 STILL = 0.003
@@ -99,6 +101,12 @@ def moved_by(objects: Superquadrics, action: Action) -> Superquadrics:
         position=jnp.where(moves[:, None], position, objects.position),
         rotation=jnp.where((moves & holds)[:, None, None], turned, objects.rotation),
     )
+
+
+@cached_jit()
+def expected(before: Observation, action: Action) -> Observation:
+    """A look's observation with its objects where an action, executed since then, is planned to leave them."""
+    return before.replace(objects=moved_by(before.objects, action))
 
 
 def _any_kind(action: Action, what: str) -> Bool[Array, ""]:

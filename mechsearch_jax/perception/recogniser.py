@@ -24,6 +24,7 @@ from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.edges import on_own_surfaces
 from mechsearch_jax.perception.explanation import Explaining, Fitted, Fitter, as_segmented
+from mechsearch_jax.perception.fusion import fused
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
@@ -127,7 +128,9 @@ class ViewRecogniser(PyTreeNode):
             capacity,
         )
 
-    def __call__(self, camera: Camera, view: View, shelf: Shelf, images: ViewImages) -> Observation:
+    def __call__(
+        self, camera: Camera, view: View, shelf: Shelf, images: ViewImages, before: Observation | None = None
+    ) -> Observation:
         """The observation of the images of a view; the same images always give the same observation.
 
         Args:
@@ -135,23 +138,30 @@ class ViewRecogniser(PyTreeNode):
           view: the rays of it that the images have.
           shelf: in the images.
           images: of the view.
+          before: an earlier look, its objects where they are expected now: what it shows better is kept, see `fusion`.
+            Objects with parts are not.
         """
-        fitted, visible = self.fitted(camera, view, shelf, images)
+        fitted, visible = self.fitted(camera, view, shelf, images, before)
         share = measured_share(camera, view, images.depth)
         return Observation(fitted.objects, visible, fitted.target_pose, fitted.confidence, share)
 
-    def fitted(self, camera: Camera, view: View, shelf: Shelf, images: ViewImages) -> tuple[Fitted, Bool[Array, ""]]:
+    def fitted(
+        self, camera: Camera, view: View, shelf: Shelf, images: ViewImages, before: Observation | None = None
+    ) -> tuple[Fitted, Bool[Array, ""]]:
         """What was made of the images, with the pixels of each object, and whether the target is visible.
 
         Args:
-          camera, view, shelf, images: as above.
+          camera, view, shelf, images, before: as above.
         """
         # Not of the caller's key, lest an object be seen or not by chance.
         keys = jax.random.split(jax.random.key(0), 3)
         image, visible = labelled(self, keys[0], camera, view, shelf, images)
         fitter = self.fitter if images.mask is None else self.mask_fitter
         settings = (self.shapes, view.camera, shelf, self.target, self.refinement)
-        return fitter(keys[1:], image, *settings, least=SAMPLED * _threshold(camera, view)), visible
+        fitted = fitter(keys[1:], image, *settings, least=SAMPLED * _threshold(camera, view))
+        if before is not None and before.objects.parts is None and fitted.objects.parts is None:
+            fitted = fused(keys[1], fitted, before, image, visible, view.camera, shelf, self.target)
+        return fitted, visible
 
 
 @jax.tree_util.register_pytree_node_class
@@ -288,11 +298,17 @@ class Recogniser:
 
     @in_own_settings
     def unchecked(
-        self, key: Key[Array, ""], depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None
+        self,
+        key: Key[Array, ""],
+        depth: Any,
+        colour: Any = None,
+        mask: Any = None,
+        target_id: Any = None,
+        before: Observation | None = None,
     ) -> Observation:
-        """The same of images that `check_images` was called with before."""
+        """The same of images that `check_images` was called with before; `before` as of `ViewRecogniser`."""
         images = view_images(self.view, depth, colour, mask, target_id)
-        return self.core(self.camera, self.view, self.shelf, images)
+        return self.core(self.camera, self.view, self.shelf, images, before)
 
     @in_own_settings
     def fitted(

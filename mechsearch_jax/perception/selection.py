@@ -231,7 +231,9 @@ def select_objects(
         possible &= jnp.all(~moves.added | scene.valid[None], axis=1)
         possible &= jnp.sum(after & ~of_target[None], axis=1) <= slots
         block = 1 if on_cpu() else slots
-        costs_after = masked_vmap(lambda _, table, row: _total(table, row), possible, None, table, after, block=block)
+        costs_after = masked_vmap(
+            lambda _, table, row: explanation_cost(table, row), possible, None, table, after, block=block
+        )
         return after, jnp.where(possible, present - costs_after, -jnp.inf)
 
     def step(state):
@@ -245,13 +247,13 @@ def select_objects(
 
     start = scene.valid & ((jnp.arange(capacity) < slots) | of_target)
     unlimited, nothing = jnp.full(capacity, jnp.inf), jnp.full(len(needed), -jnp.inf)
-    state = (start, _total(table, start), jnp.array(True), 0, unlimited, nothing)
+    state = (start, explanation_cost(table, start), jnp.array(True), 0, unlimited, nothing)
     selected, _, _, _, margin, gains = jax.lax.while_loop(lambda state: state[2] & (state[3] < slots), step, state)
     left = jnp.min(jnp.where(moves.removed, -gains[:, None], jnp.inf), axis=0)
     return Selection(selected, jnp.minimum(margin, left))
 
 
-def _total(table: tuple[Array, Array, Array, Array], selected: Bool[Array, " c"]) -> Array:
+def explanation_cost(table: tuple[Array, Array, Array, Array], selected: Bool[Array, " c"]) -> Array:
     """The cost of an explanation; `table` has each object's cost of each point, its price, its overlaps, and a point's
     number of pixels."""
     cost, price, overlap, weight = table

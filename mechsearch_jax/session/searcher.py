@@ -27,6 +27,7 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.belief.impasse import hindrance, impasse
+from mechsearch_jax.belief.unseen_motion import expected
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
@@ -226,7 +227,7 @@ class Searcher:
         with Preparing(lambda text: None) as preparing:
             preparing.add(first)
             stage()
-            seen = jax.block_until_ready(self.recogniser(key, *images))
+            seen = jax.block_until_ready(self._recognised(key, images))
             hidden, visible = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
             stage()
             belief = jax.block_until_ready(believe(problem, unsearched(problem, hidden), hidden)).belief
@@ -350,11 +351,18 @@ class Searcher:
         """
         problem = self.problem
         look, of_images = faults.check_image(problem, self.workcell.calibration, images, self.recogniser)
-        recognise = self.recogniser.unchecked if isinstance(self.recogniser, Recogniser) else self.recogniser
-        observation = faults.checked(recognise(key, *images)).judged()
+        observation = faults.checked(self._recognised(key, images)).judged()
         unseen = sight_faults(look, observation)
         of_objects = faults.recognition_warnings(problem, look, observation, self.recogniser)
         return observation, [*self._view_warnings, *of_images, *unseen, *of_objects], unseen
+
+    def _recognised(self, key: Array, images: Images) -> Observation:
+        """What is recognised in images that were checked, with what the last look showed better."""
+        if not isinstance(self.recogniser, Recogniser):
+            return self.recogniser(key, *images)
+        now = self._now
+        action = now.action if now.acted and now.executed else no_action()
+        return self.recogniser.unchecked(key, *images, before=expected(now.observation, action))
 
     def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
         """Keep of a step what the next one needs."""

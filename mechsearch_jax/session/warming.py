@@ -100,7 +100,7 @@ class _FixedRecogniser(Recogniser):
             object.__setattr__(self, field.name, getattr(like, field.name))
         object.__setattr__(self, "_observation", observation)
 
-    def unchecked(self, *images: Any) -> Observation:
+    def unchecked(self, *images: Any, **before: Any) -> Observation:
         return self.__dict__["_observation"]
 
 
