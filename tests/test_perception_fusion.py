@@ -33,7 +33,7 @@ def objects(*boxes):
     sizes = np.array(sizes, np.float32).reshape(-1, 3)
     place = np.stack([X + np.array(x), Y + np.array(y), SHELF.board + sizes[:, 2]], axis=-1)
     found = Superquadrics(
-        sizes, np.full((count, 2), 0.2), place, np.stack([yaw_rotation(jnp.float32(a)) for a in yaw]), np.ones(count)
+        sizes, np.full((count, 2), 0.2), place, np.array([yaw_rotation(jnp.float32(a)) for a in yaw]).reshape(-1, 3, 3), np.ones(count)
     )
     return jax.tree.map(lambda a, b: jnp.asarray(a).at[:count].set(jnp.asarray(b, a.dtype)), nothing, found)
 

@@ -24,6 +24,7 @@ from mechsearch_jax.images.target_pose import (
     SampledPixels,
     away_from,
     depth_tolerance,
+    descend,
     distance,
     evidence,
     target_poses,
@@ -43,6 +44,10 @@ TARGET_POINTS = 256
 SIDES, BESIDE = (0.0, -0.5, 0.5, -1.0, 1.0), 1024
 # Fits whose evidence differs by less than this share of the best one's are compared by the distances of points alone.
 EQUAL = 0.03
+# A pose of before that is turned by more than this from the new one [rad] stays if it fits within such a distance of
+# where it was [m], less of the evidence speaks for it by at most the third share, and the new one's cost is not lower
+# than the last share of its own.
+TURNED, STANDS, UNDECIDED, DECIDED = 0.5, 0.015, 0.1, 0.8
 # Neighbours are pixels within a square of this width whose depth differs by at most `LIKE_DEPTH` [m] and, where colours
 # are averaged, whose colour differs by at most `LIKE_COLOUR`, as the length of the difference of red, green and blue:
 # with noise of 8/255 in each channel, one in a thousand differs more.
@@ -170,11 +175,27 @@ def fitted_pose(
       depth: of the points [m]; NaN where nothing was measured, infinite where there is nothing.
       of_target: the target's pixels; if there are none, the pose is meaningless, but finite.
     """
+    drawn, seen, sample = _compared(key, target, camera, points, depth, of_target)
+    origin = jnp.array(camera.position)
+    poses, costs = target_poses(target, shelf, origin, drawn, seen, SIDES)
+    proof = jax.vmap(lambda pose: evidence(target, upright(target, shelf, pose), origin, sample))(poses)
+    worth = proof.support - proof.contrary
+    good = worth >= jnp.max(worth) - jnp.maximum(2.0, EQUAL * jnp.max(proof.support))
+    return poses[jnp.argmin(jnp.where(good, costs, jnp.inf))], seen[0]
+
+
+def _compared(
+    key: Key[Array, ""],
+    target: Target,
+    camera: Camera,
+    points: Float[Array, "h w 3"],
+    depth: Float[Array, "h w"],
+    of_target: Bool[Array, "h w"],
+) -> tuple[Float[Array, "n 3"], Bool[Array, " n"], SampledPixels]:
+    """Points of the target, which of them count, and pixels whose rays may meet it; arguments as of `fitted_pose`."""
     flat, origin = points.reshape(-1, 3), jnp.array(camera.position)
     index, count = draw(key, of_target.reshape(-1), TARGET_POINTS)
     drawn, seen = flat[index], jnp.broadcast_to(count > 0, TARGET_POINTS)
-    poses, costs = target_poses(target, shelf, origin, drawn, seen, SIDES)
-    # Rays that may meet the target at one of the poses.
     reach = 2.0 * float(sum(half**2 for half in target.half_size)) ** 0.5
     middle = jnp.sum(jnp.where(seen[:, None], drawn, 0.0), axis=0) / TARGET_POINTS - origin
     along = rays(camera).reshape(-1, 3)
@@ -185,10 +206,45 @@ def fitted_pose(
     sample = SampledPixels(
         along[beside], flat[beside], depth.reshape(-1)[beside], chosen[beside], jnp.broadcast_to(tolerance, BESIDE)
     )
-    proof = jax.vmap(lambda pose: evidence(target, upright(target, shelf, pose), origin, sample))(poses)
+    return drawn, seen, sample
+
+
+def steady_pose(
+    key: Key[Array, ""],
+    target: Target,
+    shelf: Shelf,
+    camera: Camera,
+    points: Float[Array, "h w 3"],
+    depth: Float[Array, "h w"],
+    of_target: Bool[Array, "h w"],
+    pose: Float[Array, " 3"],
+    before: Float[Array, " 3"],
+) -> Float[Array, " 3"]:
+    """The pose of a target that may still stand where it stood: the earlier one, fitted to this image, unless the image
+    decides for its own.
+
+    Where sides are about as wide, or few of them are seen, noise decides between poses that explain an image alike, and
+    their yaw would flip from look to look.
+
+    Args:
+      key: PRNG key of the drawn points.
+      target, shelf, camera, points, depth, of_target: as of `fitted_pose`.
+      pose: fitted to this image, as x, y [m] and yaw [rad].
+      before: of an earlier look.
+    """
+    drawn, seen, sample = _compared(key, target, camera, points, depth, of_target)
+    weight, origin = seen.astype(jnp.float32), jnp.array(camera.position)
+    drawn = jnp.where(seen[:, None], drawn, 0.0)
+    both, costs = jax.vmap(lambda start: descend(lambda at: distance(target, shelf, at, drawn), weight, start))(
+        jnp.stack([pose, before])
+    )
+    proof = jax.vmap(lambda at: evidence(target, upright(target, shelf, at), origin, sample))(both)
     worth = proof.support - proof.contrary
-    good = worth >= jnp.max(worth) - jnp.maximum(2.0, EQUAL * jnp.max(proof.support))
-    return poses[jnp.argmin(jnp.where(good, costs, jnp.inf))], count > 0
+    turned = jnp.abs(jnp.mod(both[1, 2] - pose[2] + target.turn / 2, target.turn) - target.turn / 2) > TURNED
+    stays = jnp.sum((both[1, :2] - before[:2]) ** 2) < STANDS**2
+    alike = worth[1] >= worth[0] - jnp.maximum(2.0, UNDECIDED * proof.support[0])
+    kept = turned & stays & alike & (costs[0] > DECIDED * costs[1])
+    return jnp.where(kept, both[1].at[2].set(jnp.mod(both[1, 2], target.turn)), pose)
 
 
 def near_target(

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Key
 
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.images.detection import steady_pose
 from mechsearch_jax.images.labels import OTHER
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.explanation import ExplanationConfig, Fitted
@@ -33,12 +34,13 @@ from mechsearch_jax.workspace.target_view import main_body
 SHARP = 0.03
 # A remembered object is fitted to the pixels of the objects whose centres are so near to its own [m].
 NEAR = 0.06
-# With its size kept.
+# With its size kept, and its height to this [m].
+LEVEL = 0.015
 RIGID = RefinementConfig(
     hypotheses=(), size_prior=0.002, position_prior=0.02, yaw_prior=0.2, stages=((8, 0.008), (12, 0.003))
 )
 # It may explain so many pixels fewer, and this share of those of the objects whose place it takes.
-SLACK, SLACK_SHARE = 8.0, 0.03
+SLACK, SLACK_SHARE = 8.0, 0.12
 # It has to have been surer by this.
 SURER = 0.05
 # Of a slot without an object.
@@ -63,7 +65,8 @@ def fused(
     Args:
       key: of the points drawn from the image.
       fitted: what was made of the image alone; objects without parts.
-      before: an earlier look, its objects where they are expected now, with their confidence.
+      before: an earlier look, its objects where they are expected now, with their confidence. A visible target is taken
+        to stand where it stood, if the image agrees.
       image: which was fitted.
       visible: whether it shows the target.
       camera, shelf: of the image; they may be traced.
@@ -73,11 +76,18 @@ def fused(
       The objects, with the confidence that they were recognised with, and the pixels of those whose place they take.
       `measures` stay those of the image alone.
     """
-    slots, now, was, sure = fitted.objects.capacity, fitted.objects, before.objects, jnp.asarray(before.judged().confidence)
+    slots, now, was, sure = (
+        fitted.objects.capacity,
+        fitted.objects,
+        before.objects,
+        jnp.asarray(before.judged().confidence),
+    )
     image = image.replace(labels=fitted.labels)
     flat, labels = image.points.reshape(-1, 3), fitted.labels.reshape(-1)
     sample = sample_of(key, image, now, camera, shelf, costs)
-    x, y, yaw = fitted.target_pose
+    seen = target, shelf, camera, image.points, image.depth, image.of_target
+    steady = steady_pose(key, *seen, fitted.target_pose, before.target_pose)
+    x, y, yaw = pose = jnp.where(visible & before.target_visible, steady, fitted.target_pose)
     place = jnp.stack([x, y, jnp.float32(target.height(shelf))])
     body = main_body(target, place[None], yaw_rotation(yaw)[None], visible[None])
 
@@ -88,6 +98,9 @@ def fused(
     owner = jnp.where(labels >= 0, nearest[jnp.clip(labels, 0, slots - 1)], labels).astype(jnp.int8)
     sharp = was.replace(exponents=jnp.where(was.exponents > EDGE, was.exponents, SHARP))
     moved = refine(camera, shelf, sharp, flat, owner, image.depth, RIGID).scene
+    # Where a top is lower than it was, a fit sinks into the board.
+    level = jnp.abs(moved.position[:, 2] - was.position[:, 2]) < LEVEL
+    moved = moved.replace(valid=moved.valid & level)
 
     known: Superquadrics = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), was, moved)
     everything: Superquadrics = jax.tree.map(lambda *a: jnp.concatenate(a), now, known, body)
@@ -126,12 +139,15 @@ def fused(
     start = everything.valid & ((index < slots) | (index == everything.capacity - 1))
     source, goes_to = jnp.where(now.valid, index[:slots], ABSENT), index[:slots]
     _, source, goes_to = jax.lax.fori_loop(0, slots, consider, (start, source, goes_to))
-    objects = jax.tree.map(lambda a: a[jnp.maximum(source, 0)], everything)
-    objects = standard_edges(objects.replace(valid=source >= 0))
-    confidence = jnp.concatenate([fitted.confidence, sure, sure])[jnp.maximum(source, 0)]
+    # What is replaced stays in its slot as an absent one.
+    row = jnp.where(source == ABSENT, index[:slots], source)
+    objects = jax.tree.map(lambda a: a[row], everything)
+    objects = standard_edges(objects.replace(valid=source != ABSENT))
+    confidence = jnp.concatenate([fitted.confidence, sure, sure])[row]
     labels = jnp.where(labels >= 0, goes_to[jnp.clip(labels, 0, slots - 1)], labels)
     return fitted.replace(
         objects=objects,
+        target_pose=pose,
         confidence=jnp.where(objects.valid, confidence, 0.0),
         labels=labels.reshape(fitted.labels.shape).astype(fitted.labels.dtype),
         changed=fitted.changed | (source >= slots),

@@ -362,7 +362,10 @@ class Searcher:
             return self.recogniser(key, *images)
         now = self._now
         action = now.action if now.acted and now.executed else no_action()
-        return self.recogniser.unchecked(key, *images, before=expected(now.observation, action))
+        # A found target may have been seen before the last look.
+        seen = {"target_visible": now.belief.found, "target_pose": now.belief.found_pose}
+        before = expected(now.observation.replace(**seen), action)
+        return self.recogniser.unchecked(key, *images, before=before)
 
     def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
         """Keep of a step what the next one needs."""
