@@ -8,7 +8,9 @@ import pytest
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty, standard_edges
 from mechsearch_jax.geometry.transforms import yaw_rotation
 from mechsearch_jax.images.cloud import above_board, thinned_view
+from mechsearch_jax.images.detection import BESIDE, TARGET_POINTS, fitted_pose, other_yaw, steady_pose, turned_by
 from mechsearch_jax.images.labels import CAPACITY, FREE
+from mechsearch_jax.images.target_pose import SampledPixels
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.confidence import Measures
 from mechsearch_jax.perception.explanation import Fitted
@@ -18,6 +20,7 @@ from mechsearch_jax.workspace.camera import Camera, back_project, rays
 from mechsearch_jax.workspace.render import object_depth
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.target_view import main_body
 
 CAMERA, SHELF, TARGET = Camera(), Shelf(), Target.of("cylinder")
 VIEW = thinned_view(CAMERA, SHELF)
@@ -33,7 +36,11 @@ def objects(*boxes):
     sizes = np.array(sizes, np.float32).reshape(-1, 3)
     place = np.stack([X + np.array(x), Y + np.array(y), SHELF.board + sizes[:, 2]], axis=-1)
     found = Superquadrics(
-        sizes, np.full((count, 2), 0.2), place, np.array([yaw_rotation(jnp.float32(a)) for a in yaw]).reshape(-1, 3, 3), np.ones(count)
+        sizes,
+        np.full((count, 2), 0.2),
+        place,
+        np.array([yaw_rotation(jnp.float32(a)) for a in yaw]).reshape(-1, 3, 3),
+        np.ones(count),
     )
     return jax.tree.map(lambda a, b: jnp.asarray(a).at[:count].set(jnp.asarray(b, a.dtype)), nothing, found)
 
@@ -123,3 +130,41 @@ def test_what_this_look_contradicts_is_not_kept(image, before):
     fitted, after = fuse(image, ([DEEP, OTHER_BOX], [0.8, 0.95]), before)
     for name in ("objects", "confidence", "labels", "changed"):
         jax.tree.map(np.testing.assert_array_equal, getattr(after, name), getattr(fitted, name))
+
+
+def noisy_image(body, seed):
+    """The image of a target's body alone, with 3 mm of noise, and the target's pixels."""
+    camera, directions = VIEW.camera, rays(VIEW.camera)
+    board = (SHELF.board - camera.position[2]) / np.minimum(np.asarray(directions)[..., 2], -1e-6)
+    depth = np.asarray(object_depth(body, jnp.array(camera.position), directions))
+    noise = np.random.default_rng(seed).normal(0, 0.003, depth.shape)
+    seen = jnp.asarray(np.minimum(depth, board) + noise, jnp.float32)
+    return back_project(camera, seen), seen, jnp.asarray(depth < board)
+
+
+@pytest.mark.parametrize(("wide", "decided"), [(0.036, False), (0.06, True)])
+def test_a_yaw_that_an_image_does_not_decide_stays_and_is_said(wide, decided):
+    """A box 35 mm deep, and nearly as wide, or much wider."""
+    target = Target.of("box", half_size=(0.0175, wide / 2, 0.055))
+    place = jnp.array([X, Y, float(target.height(SHELF))])
+    body = main_body(target, place, yaw_rotation(jnp.float32(0.4)), jnp.array(True))
+    points, depth, of_target = noisy_image(body, 1)
+    key, seen = jax.random.key(0), (target, SHELF, VIEW.camera, points, depth, of_target)
+    pose, _ = fitted_pose(key, *seen)
+    across = pose.at[2].add(jnp.pi / 2)
+    steady = steady_pose(key, *seen, pose, across)
+    expected = pose if decided else across
+    assert float(turned_by(target, steady[2], expected[2])) < 0.1
+    np.testing.assert_allclose(steady[:2], place[:2], atol=0.005)
+    # One that stood elsewhere does not come back.
+    np.testing.assert_array_equal(steady_pose(key, *seen, pose, across.at[0].add(-0.05)), pose)
+
+    rng = np.random.default_rng(2)
+    drawn = points[of_target][rng.integers(0, int(of_target.sum()), TARGET_POINTS)]
+    near = np.flatnonzero(np.linalg.norm(np.asarray(points) - np.asarray(place), axis=-1) < 0.12)
+    flat = [a.reshape(-1, 3) for a in (rays(VIEW.camera), points)]
+    chosen = rng.choice(near, BESIDE)
+    sample = SampledPixels(*(a[chosen] for a in (*flat, depth.reshape(-1), of_target.reshape(-1))), jnp.zeros(BESIDE))
+    other = other_yaw(target, SHELF, jnp.array(VIEW.camera.position), drawn, sample, pose)
+    assert bool(jnp.isnan(other)) == decided
+    assert decided or float(turned_by(target, other, across[2])) < 0.3

@@ -9,6 +9,7 @@ on the surface of the fitted target are the target's, too.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -19,6 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mechsearch_jax.images.cloud import MARGIN, above_board, draw
 from mechsearch_jax.images.labels import CAPACITY, OTHER
 from mechsearch_jax.images.target_pose import (
+    DEVIATIONS,
+    LARGEST_TOLERANCE,
+    LEAST_TOLERANCE,
     Evidence,
     Placement,
     SampledPixels,
@@ -48,6 +52,8 @@ EQUAL = 0.03
 # where it was [m], less of the evidence speaks for it by at most the third share, and the new one's cost is not lower
 # than the last share of its own.
 TURNED, STANDS, UNDECIDED, DECIDED = 0.5, 0.015, 0.1, 0.8
+# A yaw is not decided where the cost of another is less than so many times that of the chosen one.
+ALIKE = 1.1
 # Neighbours are pixels within a square of this width whose depth differs by at most `LIKE_DEPTH` [m] and, where colours
 # are averaged, whose colour differs by at most `LIKE_COLOUR`, as the length of the difference of red, green and blue:
 # with noise of 8/255 in each channel, one in a thousand differs more.
@@ -240,11 +246,48 @@ def steady_pose(
     )
     proof = jax.vmap(lambda at: evidence(target, upright(target, shelf, at), origin, sample))(both)
     worth = proof.support - proof.contrary
-    turned = jnp.abs(jnp.mod(both[1, 2] - pose[2] + target.turn / 2, target.turn) - target.turn / 2) > TURNED
+    turned = turned_by(target, pose[2], both[1, 2]) > TURNED
     stays = jnp.sum((both[1, :2] - before[:2]) ** 2) < STANDS**2
     alike = worth[1] >= worth[0] - jnp.maximum(2.0, UNDECIDED * proof.support[0])
     kept = turned & stays & alike & (costs[0] > DECIDED * costs[1])
     return jnp.where(kept, both[1].at[2].set(jnp.mod(both[1, 2], target.turn)), pose)
+
+
+def turned_by(target: Target, yaw: Array, other: Array) -> Array:
+    """By how much one yaw differs from another, after which the target looks otherwise [rad]."""
+    return jnp.abs(jnp.mod(other - yaw + target.turn / 2, target.turn) - target.turn / 2)
+
+
+@functools.partial(jax.jit, static_argnames="target")
+def other_yaw(
+    target: Target,
+    shelf: Shelf,
+    origin: Float[Array, " 3"],
+    drawn: Float[Array, "n 3"],
+    sample: SampledPixels,
+    pose: Float[Array, " 3"],
+) -> Float[Array, ""]:
+    """Another yaw [rad] at which the target would explain an image about as well as at its pose; NaN if there is none.
+
+    Args:
+      target: static.
+      shelf: on which it stands.
+      origin: the camera's position in the world [m].
+      drawn: points of the target, in the world [m].
+      sample: pixels whose rays may meet it; their tolerance is that of the drawn points' distances.
+      pose: as x, y [m] and yaw [rad].
+    """
+    usual = jnp.median(jnp.abs(distance(target, shelf, pose, drawn))) / 0.6745
+    tolerance = jnp.clip(DEVIATIONS * usual, LEAST_TOLERANCE, LARGEST_TOLERANCE)
+    sample = sample.replace(tolerance=jnp.broadcast_to(tolerance, sample.depth.shape))
+    fit = descend(lambda at: distance(target, shelf, at, drawn), jnp.ones(len(drawn)), pose)
+    fits = target_poses(target, shelf, origin, drawn, jnp.ones(len(drawn), bool), SIDES)
+    poses, costs = (jnp.concatenate([a[None], b]) for a, b in zip(fit, fits, strict=True))
+    proof = jax.vmap(lambda at: evidence(target, upright(target, shelf, at), origin, sample))(poses)
+    worth = proof.support - proof.contrary
+    alike = worth >= worth[0] - jnp.maximum(2.0, UNDECIDED * proof.support[0])
+    alike &= (costs < ALIKE * costs[0]) & (turned_by(target, pose[2], poses[:, 2]) > TURNED)
+    return jnp.where(jnp.any(alike), poses[jnp.argmin(jnp.where(alike, costs, jnp.inf)), 2], jnp.nan)
 
 
 def near_target(

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from mechsearch_jax.calibration.fit import Face, faces_of
 from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.cloud import above_board
-from mechsearch_jax.images.detection import fitted_pose
+from mechsearch_jax.images.detection import BESIDE, TARGET_POINTS, fitted_pose, other_yaw
 from mechsearch_jax.images.planes import TOLERANCE, find_plane
-from mechsearch_jax.images.target_pose import distance
+from mechsearch_jax.images.target_pose import SampledPixels, distance
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, project
@@ -273,6 +273,41 @@ def detection_faults(look: Look, observation: Observation) -> tuple[str, ...]:
     return (
         f"colour image: {count * part.view.stride**2} pixels have the target's colour, but nothing that shows them has "
         "its shape and size; if the target is among them, check [target] and the camera's pose",
+    )
+
+
+def yaw_faults(look: Look, observation: Observation, target: Target) -> tuple[str, ...]:
+    """A warning if another yaw of the target would explain the images about as well, such as that of its other sides.
+
+    Args:
+      look: images with colour, and a detector.
+      observation: of these images, without batch axes.
+      target: which is looked for.
+    """
+    if target.round or not bool(observation.target_visible):
+        return ()
+    part, pose, rng = look.thinned, jnp.asarray(observation.target_pose, jnp.float32), np.random.default_rng(0)
+    points, ways, origin = part.points.reshape(-1, 3), part.ways.reshape(-1, 3), np.array(part.view.camera.position)
+    chosen = (part.detected & part.above_board).reshape(-1)
+    chosen[chosen] = np.linalg.norm(points[chosen, :2] - np.asarray(pose)[:2], axis=1) < 2 * target.solid.breadth
+    if not chosen.any():
+        return ()
+    # As many as fits are made of in recognition, whatever the image shows: nothing is compiled anew.
+    drawn = points[rng.choice(np.flatnonzero(chosen), TARGET_POINTS)]
+    towards = drawn.mean(axis=0) - origin
+    along = (ways @ towards) / np.sum(ways**2, axis=1)
+    near = np.linalg.norm(along[:, None] * ways - towards, axis=1) < 2 * np.linalg.norm(target.half_size)
+    beside = rng.choice(np.flatnonzero(near), BESIDE)
+    sample = SampledPixels(
+        *(jnp.asarray(a[beside]) for a in (ways, points, part.depth.reshape(-1), chosen)), jnp.zeros(BESIDE)
+    )
+    start = jnp.asarray(origin, jnp.float32)
+    other = math.degrees(other_yaw(target, look.shelf, start, jnp.asarray(drawn), sample, pose))
+    if math.isnan(other):
+        return ()
+    return (
+        f"target: its yaw may be {other:.0f} instead of {math.degrees(pose[2]):.0f} degrees, for what is seen of it "
+        "fits both; the hand may find it wider or narrower than planned",
     )
 
 

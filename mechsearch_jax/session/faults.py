@@ -24,6 +24,7 @@ from mechsearch_jax.perception.plausibility import (
     identity_faults,
     image_faults,
     shows_nothing,
+    yaw_faults,
 )
 from mechsearch_jax.perception.recogniser import Recogniser, Setting
 from mechsearch_jax.runtime.errors import InputError
@@ -117,6 +118,7 @@ def recognition_warnings(setting: Setting, look: Look, observation: Observation,
     other: list[str] = []
     if look.detector is not None and look.colour is not None:
         other += unmeasured_target_faults(look, observation)
+        other += yaw_faults(look, observation, setting.target)
         if look.mask is None:
             other += detection_faults(look, observation)
     # Another recogniser may know of things that the images do not show.

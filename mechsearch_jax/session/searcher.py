@@ -228,6 +228,7 @@ class Searcher:
             preparing.add(first)
             stage()
             seen = jax.block_until_ready(self._recognised(key, images))
+            warming.yaw(problem)
             hidden, visible = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
             stage()
             belief = jax.block_until_ready(believe(problem, unsearched(problem, hidden), hidden)).belief
@@ -363,9 +364,9 @@ class Searcher:
         now = self._now
         action = now.action if now.acted and now.executed else no_action()
         # A found target may have been seen before the last look.
-        seen = {"target_visible": now.belief.found, "target_pose": now.belief.found_pose}
-        before = expected(now.observation.replace(**seen), action)
-        return self.recogniser.unchecked(key, *images, before=before)
+        found, pose = now.belief.found, now.belief.found_pose
+        before = Observation(now.observation.objects, found, pose, now.observation.confidence)
+        return self.recogniser.unchecked(key, *images, before=expected(before, action))
 
     def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
         """Keep of a step what the next one needs."""

@@ -15,6 +15,8 @@ from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief
+from mechsearch_jax.images.detection import BESIDE, TARGET_POINTS, other_yaw
+from mechsearch_jax.images.target_pose import SampledPixels
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.recogniser import Recogniser
@@ -109,6 +111,13 @@ def fixed_recogniser(recogniser: Any, observation: Observation) -> Callable[...,
     if isinstance(recogniser, Recogniser):
         return _FixedRecogniser(recogniser, observation)
     return lambda *images: observation
+
+
+def yaw(problem: Problem) -> None:
+    """Compile what says whether another yaw of the target is possible."""
+    zeros = jnp.zeros((BESIDE, 3))
+    sample = SampledPixels(zeros, zeros, zeros[:, 0], jnp.zeros(BESIDE, bool), zeros[:, 0])
+    other_yaw(problem.target, problem.shelf, jnp.zeros(3), jnp.zeros((TARGET_POINTS, 3)), sample, jnp.zeros(3))
 
 
 def motions(problem: Problem, action: Action, config: MotionConfig | None) -> None:
