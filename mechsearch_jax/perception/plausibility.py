@@ -298,9 +298,8 @@ def yaw_faults(look: Look, observation: Observation, target: Target) -> tuple[st
     along = (ways @ towards) / np.sum(ways**2, axis=1)
     near = np.linalg.norm(along[:, None] * ways - towards, axis=1) < 2 * np.linalg.norm(target.half_size)
     beside = rng.choice(np.flatnonzero(near), BESIDE)
-    sample = SampledPixels(
-        *(jnp.asarray(a[beside]) for a in (ways, points, part.depth.reshape(-1), chosen)), jnp.zeros(BESIDE)
-    )
+    rays, ends, depth, like_it = (jnp.asarray(a[beside]) for a in (ways, points, part.depth.reshape(-1), chosen))
+    sample = SampledPixels(rays, ends, depth, like_it, jnp.zeros(BESIDE))
     start = jnp.asarray(origin, jnp.float32)
     other = math.degrees(other_yaw(target, look.shelf, start, jnp.asarray(drawn), sample, pose))
     if math.isnan(other):
