@@ -124,7 +124,7 @@ def test_what_the_hand_holds_after_a_failed_grasp_is_asked_for_and_not_dropped(p
 
 
 def picks(key, problem, belief, observation):
-    """A policy that picks object 0 of `OPEN` and puts it down nearer to the front."""
+    """A policy that picks object 0 of `OPEN` and puts it down beside."""
     rotation = gripper_rotation(jnp.float32(-0.2), jnp.float32(0.436))
     T = make(rotation, jnp.asarray(observation.objects.position[0]) + jnp.float32([0.0, 0.0, 0.01]))
     action = Action(
@@ -132,7 +132,7 @@ def picks(key, problem, belief, observation):
         object=jnp.int32(0),
         T_world_gripper=T,
         displacement=jnp.zeros(3),
-        T_world_place=T.at[0, 3].add(-0.06),
+        T_world_place=T.at[:2, 3].add(jnp.float32([-0.04, 0.07])),
         q7=jnp.float32(math.radians(45)),
         opening=jnp.float32(0.08),
     )

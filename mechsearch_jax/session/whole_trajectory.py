@@ -25,6 +25,7 @@ from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import (
     ALWAYS,
     HAND_FRAME,
+    SHELF,
     TARGET,
     ArmBody,
     Held,
@@ -131,7 +132,8 @@ def whole_trajectory(
     the shelf if the target would hit something at home. The trajectory of no action is the way home.
 
     As it puts an object down, the hand and what it holds keep `config.free.clearance`, divided by the other object's
-    confidence, from each other object; it is let go as high as a corner may hang if it turns between the fingers.
+    confidence, from each other object, and the hand stays out of the shelf's margins; the object is let go as high as a
+    corner may hang if it turns between the fingers.
 
     The fingers move as a real hand does: what it does is in `events`, and the arm stands still where one has to have
     ended. The first, which opens or closes them for the action, is there whatever `width` is.
@@ -267,7 +269,7 @@ class _Assembly:
         grip = grip_for(self.problem, self.observation, self.action)
         stages.append(_Stage(Part.ACTION, acting(reference, grip, self.motion, self.hand, self.speed)))
         self._check_obstacles(stages[-1])
-        self._check_placing(stages[-1].rows)
+        self._check_placing(stages[-1])
         between = self._between(stages[-1].rows)
 
         fault, at_home = "", True
@@ -565,24 +567,24 @@ class _Assembly:
             name, depth = touches[0].body, -1000 * touches[0].distance
             raise InputError(f"{self.kind.name}: the arm would pass {depth:.0f} mm through {name}; decide anew")
 
-    def _check_placing(self, acted: Rows) -> None:
-        """Check that hand and held object keep clear of what stands beside, from in front of the shelf to the end.
+    def _check_placing(self, action: _Stage) -> None:
+        """Check that hand and held object keep clear of what stands beside, and of the shelf, as they put it down.
 
         Raises:
           InputError: they do not.
         """
-        x = tip_positions(acted.position)[:, 0]
-        outside = np.flatnonzero((x <= self.problem.gripper.nearest_outside + OUTSIDE) & (acted.force > 0.0))
+        acted, carried, keep = action.rows, int(self.action.object), self.config.free.clearance
+        x, holds = tip_positions(acted.position)[:, 0], acted.force > 0.0
+        outside = np.flatnonzero((x <= self.problem.gripper.nearest_outside + OUTSIDE) & holds)
         if not (self.kind.holds_object and len(outside)):
             return
-        rows = np.arange(outside[-1], len(x))
-        carried, keep = int(self.action.object), self.config.free.clearance
         sure = np.asarray(self.observation.judged().confidence, float)
-        least = {TARGET: keep} | {f"object {i}": keep / max(share, LEAST_SURE) for i, share in enumerate(sure)}
-        for holding in (True, False):
-            of = rows[(acted.force[rows] > 0.0) == holding]
-            body = ArmBody.of(float(acted.width[of].max()), self._held() if holding else None)
-            for name, distance, _ in nearest_rows(body, self._obstacles(without=carried), acted.position[of]):
+        beside = {f"object {i}": keep / max(share, LEAST_SURE) for i, share in enumerate(sure) if i != carried}
+        # The shelf has margins of its own.
+        least = {TARGET: keep, SHELF: 0.0, **beside}
+        placing = np.arange(outside[-1], len(x))
+        for phase, rows in ((1, placing[holds[placing]]), (2, placing[~holds[placing]])):
+            for name, distance, _ in self._nearest_rows(action, phase, rows):
                 if distance < least.get(name, -np.inf):
                     raise InputError(
                         f"{self.kind.name}: where it puts object {carried} down, the hand or what it holds would be "
