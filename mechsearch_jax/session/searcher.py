@@ -496,15 +496,17 @@ class Searcher:
     ) -> tuple[Decided, Motion]:
         """A decision and its motion, drawn anew where the arm cannot execute it."""
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
+        refused = self._now.refusals
+        # Where no place was found that is clear enough, less has to do.
+        config = dataclasses.replace(self._motions, beside=self._motions.beside / (1 + refused))
 
         def executable(decision: Decision) -> bool:
             belief, observation = state.belief, state.observation
-            settings = unseen, present, arm, self._motions, self._now.failures
+            settings = unseen, present, arm, config, self._now.failures
             motions.append(motion_of(problem, belief, observation, decision, depth, *settings))
             return not motions[-1].blocked
 
         last = self._now.index >= self.config.max_steps
-        refused = self._now.refusals
         decided = decide(self._policy, trials, key, problem, state, last=last, refusals=refused, executable=executable)
         return decided, self._within_limit(motions[-1], state)
 

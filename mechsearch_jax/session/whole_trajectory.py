@@ -24,6 +24,7 @@ from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import (
     ALWAYS,
+    FARTHEST,
     HAND_FRAME,
     SHELF,
     TARGET,
@@ -44,7 +45,7 @@ from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.nearest import nearest_rows
 from mechsearch_jax.robot.robot_trajectory import Bounds, Nearest, Part, RobotTrajectory, derivatives
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session.placing import PlaceWay, place_ways
 from mechsearch_jax.workspace.obstacle import Obstacle
@@ -82,6 +83,8 @@ class TrajectoryConfig:
       doubt: when recognition is too doubtful to move.
       hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
       place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
+      beside: how far hand and held object keep from other objects as they put one down, divided by how sure these are
+        [m]; a `Searcher` takes less, a half, a third and so on, after looks at which nothing could be done.
       without_gain: whether a `Searcher` also hands out motions of which no lower cost is expected.
       obstacles: what else the arm keeps clear of; a `Searcher` adds its workcell's, the camera's body among them.
     """
@@ -92,11 +95,13 @@ class TrajectoryConfig:
     doubt: DoubtConfig = dataclasses.field(default_factory=DoubtConfig)
     hand: HandConfig | None = None
     place: tuple[float, ...] = ()
+    beside: float = 0.01
     without_gain: bool = False
     obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self):
         check_place("TrajectoryConfig: place", self.place)
+        check_range("TrajectoryConfig: beside", self.beside, 0.0, FARTHEST, "m")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -131,7 +136,7 @@ def whole_trajectory(
     puts the target down at `config.place`; if there is none, or it cannot, it brings the target home, or stops outside
     the shelf if the target would hit something at home. The trajectory of no action is the way home.
 
-    As it puts an object down, the hand and what it holds keep `config.free.clearance`, divided by the other object's
+    As it puts an object down, the hand and what it holds keep `config.beside`, divided by the other object's
     confidence, from each other object, and the hand stays out of the shelf's margins; the object is let go as high as a
     corner may hang if it turns between the fingers.
 
@@ -485,7 +490,8 @@ class _Assembly:
     def _held(self) -> Held:
         """What the closed hand holds; a target that is not visible is assumed between the fingers."""
         what = grasped(self.problem, self.observation, self.action)
-        return Held(np.linalg.inv(np.asarray(self.action.T_world_gripper, float)) @ what.T_world_object, what.size)
+        T_gripper_world = np.linalg.inv(np.asarray(self.action.T_world_gripper, float))
+        return Held.of(T_gripper_world @ what.T_world_object, what.size, what.exponents)
 
     def _sag(self) -> float:
         """How much lower a corner of the held object may hang, which turns about the closing direction [m]."""
@@ -573,7 +579,7 @@ class _Assembly:
         Raises:
           InputError: they do not.
         """
-        acted, carried, keep = action.rows, int(self.action.object), self.config.free.clearance
+        acted, carried, keep = action.rows, int(self.action.object), self.config.beside
         x, holds = tip_positions(acted.position)[:, 0], acted.force > 0.0
         outside = np.flatnonzero((x <= self.problem.gripper.nearest_outside + OUTSIDE) & holds)
         if not (self.kind.holds_object and len(outside)):
