@@ -13,11 +13,20 @@ from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Held, Obstacles, clearance, tip_positions
+from mechsearch_jax.robot.arm_clearance import (
+    FARTHEST,
+    HAND_FRAME,
+    ArmBody,
+    Held,
+    Obstacles,
+    bounds,
+    clearance,
+    tip_positions,
+)
 from mechsearch_jax.robot.arm_config import PANDA, check_joints
 from mechsearch_jax.robot.free_motion import FreeMotionConfig, free_motion, free_path
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
-from mechsearch_jax.robot.kinematics import HOME, gripper_pose, inverse_kinematics
+from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME, gripper_pose, inverse_kinematics
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -238,3 +247,20 @@ def test_random_ends_are_joined_without_touching_anything():
 def test_poses_come_in_blocks_as_at_once():
     q = HERE + np.random.default_rng(2).normal(0.0, 0.2, (70, 7))
     np.testing.assert_allclose(tip_positions(q), jax.vmap(gripper_pose)(jnp.float32(q))[:, :3, 3], atol=1e-5)
+
+
+@pytest.mark.parametrize(("e2", "is_round"), [(0.1, False), (0.7, True), (1.0, True), (1.3, True)])
+def test_what_bounds_an_object_holds_it(e2, is_round):
+    """Points on the outline of superquadrics, and the spheres that cover one in the hand."""
+    angle = np.linspace(0.0, np.pi / 2, 500)
+    outline = np.stack([0.04 * np.cos(angle) ** e2, 0.035 * np.sin(angle) ** e2], axis=1)
+    (half_size,), (found,) = bounds(np.array([[0.04, 0.035, 0.06]]), np.array([[0.2, e2]]))
+    assert found == is_round
+    reach = np.linalg.norm(outline, axis=1).max() if is_round else outline.max()
+    assert reach <= half_size[0] + 1e-9 < reach + 0.005
+    held = Held.of(np.eye(4), (0.04, 0.035, 0.06), (0.2, e2))
+    body = ArmBody.of(0.08, held).fine
+    covers = (body.frame == HAND_FRAME) & (body.centre[:, 2] > FINGER_TIPS - 0.06)
+    points = np.concatenate([np.column_stack([outline, np.full(500, z)]) for z in (-0.06, 0.0, 0.06)])
+    gaps = np.linalg.norm(points[:, None] + [0.0, 0.0, FINGER_TIPS] - body.centre[covers], axis=-1)
+    assert (gaps - body.radius[covers]).min(axis=1).max() <= 1e-6

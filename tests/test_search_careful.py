@@ -10,14 +10,18 @@ import pytest
 from stage import HIDDEN, OPEN, grab
 from test_search import CAMERA, IMAGES, TRUSTING, searcher_of, seen
 
+from mechsearch_jax.actions import Action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.impasse import hindrance
+from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.planner import initial_belief, update_belief
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.arm_clearance import HAND_FRAME, ArmBody, link_poses, shows_arm, tip_positions
 from mechsearch_jax.robot.arm_config import ArmConfig
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.robot_trajectory import Part
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import UNREPORTED, Searcher
 from mechsearch_jax.session.step import gains
@@ -117,6 +121,95 @@ def test_what_the_hand_holds_after_a_failed_grasp_is_asked_for_and_not_dropped(p
     empty.next(IMAGES.depth)
     empty.acted(ok=False)
     assert empty.next(IMAGES.depth, width=0.0).kind == "retrieve"
+
+
+def picks(key, problem, belief, observation):
+    """A policy that picks object 0 of `OPEN` and puts it down beside."""
+    rotation = gripper_rotation(jnp.float32(-0.2), jnp.float32(0.436))
+    T = make(rotation, jnp.asarray(observation.objects.position[0]) + jnp.float32([0.0, 0.0, 0.01]))
+    action = Action(
+        kind=jnp.int32(ActionKind.PICK_AND_PLACE),
+        object=jnp.int32(0),
+        T_world_gripper=T,
+        displacement=jnp.zeros(3),
+        T_world_place=T.at[:2, 3].add(jnp.float32([-0.04, 0.07])),
+        q7=jnp.float32(math.radians(45)),
+        opening=jnp.float32(0.08),
+    )
+    return costly(11.0, 1.0)(key, problem, belief, observation).replace(action=action)
+
+
+def stopped(searcher, width):
+    """The step after the arm was stopped on its way down with object 0 in the hand."""
+    trajectory = searcher.next(IMAGES.depth).trajectory
+    carrying = np.flatnonzero((trajectory.force > 0.0) & (trajectory.part == Part.ACTION))
+    joints = trajectory.position[carrying[-40]]
+    searcher.acted(ok=False, joints=joints)
+    return searcher.next(IMAGES.depth, width=width)
+
+
+def without(observation):
+    """The same observation without object 0."""
+    objects = observation.objects
+    return dataclasses.replace(observation, objects=objects.replace(valid=objects.valid.at[0].set(False)))
+
+
+def test_an_object_in_a_hand_that_was_stopped_is_taken_out_and_put_back(problem, tmp_path):
+    shown = [seen(OPEN)]
+    of_shown = {"policy": picks, "recogniser": lambda problem: lambda *images: shown[-1]}
+    searcher = searcher_of(problem, OPEN, **of_shown)
+    step = stopped(searcher, 0.058)
+    assert (step.kind, step.index) == ("withdraw", 1)
+    assert "the hand holds something 58 mm wide after a grasp of object 0" in step.reason
+    assert step.trajectory.events == ()
+    np.testing.assert_array_equal(step.trajectory.width, 0.058)
+    assert (step.trajectory.force[1:] > 0.0).all()
+    # A search that is gone on with after a crash knows of it, too.
+    searcher.save(tmp_path / "search.npz")
+    searcher = searcher_of(problem, OPEN, **of_shown)
+    searcher.load(tmp_path / "search.npz")
+    searcher.acted()
+    blocked = searcher.next(IMAGES.depth, width=0.058)
+    assert (blocked.kind, blocked.trajectory) == ("none", None)
+    assert "on the way to its place the hand, or object 0 in it, would touch object 0" in blocked.reason
+    shown.append(without(shown[0]))
+    back = searcher.next(IMAGES.depth, width=0.058)
+    assert (back.kind, back.index) == ("put-back", 1)
+    way = back.trajectory
+    assert way.report().within()
+    np.testing.assert_allclose(way.position[[0, -1]], [HOME, HOME], atol=1e-6)
+    opens = np.flatnonzero(np.diff((way.force > 0.0).astype(int)) < 0)
+    (place,) = tip_positions(way.position[opens]) - np.asarray(seen(OPEN).objects.position[0])
+    np.testing.assert_allclose(place[:2], 0.0, atol=1e-3)
+    assert 0.012 < place[2] < 0.022
+    assert [(event.kind, event.waits) for event in way.events] == [("move", True)]
+    searcher.acted()
+    shown.append(shown[0])
+    after = searcher.next(IMAGES.depth, width=0.08)
+    assert (after.kind, after.index) == ("pick-and-place", 1)
+
+
+def test_what_is_in_a_hand_that_was_stopped_is_not_moved_where_that_is_not_safe(problem):
+    other = stopped(searcher_of(problem, OPEN, policy=picks), 0.03)
+    assert (other.kind, other.trajectory) == ("none", None)
+    assert "it is not moved: 65 mm were expected" in other.reason
+    shown = [seen(OPEN)]
+    searcher = searcher_of(problem, OPEN, policy=picks, recogniser=lambda problem: lambda *images: shown[-1])
+    stopped(searcher, 0.058)
+    searcher.acted()
+    shown.append(without(shown[0]))
+    assert searcher.next(IMAGES.depth, width=0.058).kind == "put-back"
+    searcher.acted(ok=False, joints=HOME)
+    assert searcher.next(IMAGES.depth, width=0.058).kind == "none"
+    # A target is taken out of the shelf, and then asked for.
+    searcher = searcher_of(problem, OPEN)
+    searcher.acted(ok=False, joints=inside(searcher))
+    step = searcher.next(IMAGES.depth, width=0.04)
+    assert (step.kind, float(step.trajectory.force[-1]) > 0.0) == ("withdraw", True)
+    searcher.acted()
+    assert "if it is the target, call acted(ok=True)" in searcher.next(IMAGES.depth, width=0.04).reason
+    searcher.acted(ok=True)
+    assert searcher.finished
 
 
 def test_a_grasp_that_failed_twice_is_not_tried_a_third_time(problem):

@@ -17,12 +17,12 @@ from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig, recognition_doubt
-from mechsearch_jax.robot.arm_clearance import tip_positions
+from mechsearch_jax.robot.arm_clearance import HAND_FRAME, tip_positions
 from mechsearch_jax.robot.free_motion import FreeMotionConfig
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
-from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
 from mechsearch_jax.robot.hand import HandConfig
-from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME, forward_kinematics
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part
 from mechsearch_jax.robot.trajectory_files import csv_header, save_csv, save_ros
@@ -197,6 +197,73 @@ def test_an_action_out_of_reach_is_refused():
     far = grasp().at[0, 3].add(0.5)
     with pytest.raises(InputError, match="retrieve: the arm does not reach"):
         whole_trajectory(SETTING, seen(), retrieve_action(far, Q7, jnp.float32(0.08)), config=CONFIG)
+
+
+HELD, STAND = np.array([0.02, 0.025, 0.06]), (0.58, -0.12)
+
+
+def placed(beside, sure=1.0, height=0.06):
+    """A pick-and-place of object 0, with object 1 so far to the right of its place [m], of which it is so sure."""
+    scene = empty(8)
+    for i, (place, half) in enumerate(
+        (((*PLACE, HELD[2]), HELD), ((STAND[0], STAND[1] - beside, height), [0.02, 0.02, height]))
+    ):
+        scene = scene.replace(
+            size=scene.size.at[i].set(jnp.float32(half)),
+            exponents=scene.exponents.at[i].set(0.1),
+            position=scene.position.at[i].set(jnp.float32(place) + jnp.float32([0.0, 0.0, Shelf().board])),
+            valid=scene.valid.at[i].set(True),
+        )
+    confidence = jnp.ones(8).at[1].set(sure)
+    action = Action(
+        kind=jnp.int32(2),
+        object=jnp.int32(0),
+        T_world_gripper=grasp(),
+        displacement=jnp.zeros(3),
+        T_world_place=grasp().at[:2, 3].set(jnp.float32(STAND)),
+        q7=Q7,
+        opening=jnp.float32(0.08),
+    )
+    observation = dataclasses.replace(seen(scene, visible=False), confidence=confidence)
+    return whole_trajectory(SETTING, observation, action, config=CONFIG)
+
+
+def release(trajectory):
+    """Pose of the gripper as it lets go."""
+    row = np.flatnonzero((trajectory.force[:-1] > 0.0) & (trajectory.force[1:] == 0.0))[0]
+    T = np.array(forward_kinematics(jnp.float32(trajectory.position[row]))[HAND_FRAME], float)
+    T[:3, 3] += FINGER_TIPS * T[:3, 2]
+    return T
+
+
+def test_an_object_is_put_down_clear_of_what_stands_beside():
+    """Measured at the release with points on the surface of the open hand and the box, against a box along the axes."""
+    T = np.array(grasp().at[:2, 3].set(jnp.float32(STAND)), float)
+    hand = gripper_cloud(Gripper(), 0.08, float(Q7), 20000) @ T[:3, :3].T + T[:3, 3]
+    box = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * HELD + (*STAND, Shelf().board + HELD[2])
+
+    def gap(beside, height=0.06):
+        past = np.abs(np.concatenate([hand, box]) - (STAND[0], STAND[1] - beside, Shelf().board + height))
+        return np.linalg.norm(np.maximum(past - (0.02, 0.02, height), 0.0), axis=1).min()
+
+    free = np.array([beside for beside in np.arange(0.07, 0.15, 0.0005) if gap(beside) > 0.01]).min()
+    placed(free + 0.005)
+    with pytest.raises(InputError, match=r"where it puts object 0 down, .* mm from object 1, not 10 mm or more"):
+        placed(free - 0.002)
+    with pytest.raises(InputError, match="not 25 mm or more; decide anew"):
+        placed(free + 0.005, sure=0.4)
+    placed(free + 0.02, sure=0.4)
+
+
+def test_an_object_that_turns_between_the_fingers_does_not_meet_the_board():
+    T = release(placed(0.3))
+    corners = HELD * np.stack(np.meshgrid(*3 * [[-1, 1]]), axis=-1).reshape(-1, 3)
+    stands = np.array(make(jnp.eye(3), jnp.float32([*PLACE, Shelf().board + HELD[2]])), float)
+    held = np.linalg.inv(np.array(grasp(), float)) @ stands
+    for turn in np.radians([-5, 5]):
+        about = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        points = (corners @ held[:3, :3].T + held[:3, 3]) @ about.T @ T[:3, :3].T + T[:3, 3]
+        assert 0.0 < points[:, 2].min() - Shelf().board < 0.01
 
 
 @functools.cache

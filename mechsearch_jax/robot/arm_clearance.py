@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import RobotPart, fingers, hand_parts, link_parts
 from mechsearch_jax.workspace.camera import Camera
@@ -58,15 +58,24 @@ class Spheres(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Held:
-    """The object in the closed hand, as a box.
+    """The object in the closed hand, as a box, or a cylinder about its z.
 
     Attributes:
       T_gripper_held: its pose in the gripper frame, shape (4, 4).
       half_size: half-extents [m].
+      round: whether it is a cylinder.
     """
 
     T_gripper_held: np.ndarray
     half_size: tuple[float, float, float]
+    round: bool = False
+
+    @classmethod
+    def of(cls, T_gripper_held: np.ndarray, size: tuple[float, float, float], exponents: tuple[float, float]) -> Held:
+        """A superquadric in the hand."""
+        (half_size,), (is_round,) = bounds(np.array([size], float), np.array([exponents], float))
+        x, y, z = half_size.tolist()
+        return cls(T_gripper_held, (x, y, z), bool(is_round))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,7 +109,7 @@ class Obstacles:
 
     Attributes:
       shelf: with the planner's margins; everything beyond its front plane and outside its free space is solid.
-      half_size: of the objects' bounding boxes, and of obstacles [m], shape (n, 3).
+      half_size: of what bounds the objects, and of obstacles [m], shape (n, 3); see `bounds`.
       T_box_world: inverse poses of the boxes, shape (n, 4, 4).
       floor: height of the floor [m].
       names: how messages call what there is: the arm itself, the floor, the shelf, and each of the n.
@@ -126,6 +135,7 @@ class Obstacles:
     ) -> Obstacles:
         """The shelf, the valid objects of scenes with fields (N, ...), those that the target is made of, and others."""
         sizes: list[np.ndarray] = [np.zeros((0, 3))]
+        round_ones: list[bool] = []
         poses: list[np.ndarray] = [np.zeros((0, 4, 4))]
         names = [*ALWAYS]
         for scene in (*scenes, *target):
@@ -133,7 +143,9 @@ class Obstacles:
             pose = np.tile(np.eye(4), (int(valid.sum()), 1, 1))
             pose[:, :3, :3] = np.asarray(scene.rotation, float)[valid]
             pose[:, :3, 3] = np.asarray(scene.position, float)[valid]
-            sizes.append(np.asarray(scene.size, float)[valid])
+            half_size, are_round = bounds(*(np.asarray(a, float)[valid] for a in (scene.size, scene.exponents)))
+            sizes.append(half_size)
+            round_ones += are_round.tolist()
             poses.append(np.linalg.inv(pose))
             is_target = any(scene is other for other in target)
             names += [TARGET if is_target else f"object {i}" for i in np.flatnonzero(valid)]
@@ -142,15 +154,31 @@ class Obstacles:
             pose[:3, :3], pose[:3, 3] = body.rotation, body.position
             sizes.append(np.array(body.size, float)[None] / 2)
             poses.append(np.linalg.inv(pose)[None])
+            round_ones.append(body.shape == "cylinder")
             names.append(f'obstacle "{body.name}"')
         half_size, inverse = (np.concatenate(rows).astype(np.float32) for rows in (sizes, poses))
-        round_ones = [False] * (len(half_size) - len(bodies)) + [body.shape == "cylinder" for body in bodies]
         return cls(shelf, half_size, inverse, floor, tuple(names), tuple(round_ones))
 
     @property
     def bare(self) -> Obstacles:
         """Without objects, target and other bodies."""
         return Obstacles.of(self.shelf, floor=self.floor)
+
+
+def bounds(
+    size: Float[np.ndarray, "n 3"], exponents: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Half-extents of a box, or of a cylinder about z, around superquadrics [m], and which of them are cylinders.
+
+    Round ones of nearly a circle are; at e2 below 1 the circle has to go through what is left of corners.
+    """
+    x, y, e2 = size[:, 0], size[:, 1], exponents[:, 1]
+    across = np.maximum(x, y)
+    are_round = (e2 > ROUND_EXPONENT) & (e2 < 1.0 + ROUND_EXPONENT) & (np.minimum(x, y) > 0.8 * across)
+    # Beyond 1 the corners are at the axes' ends.
+    radius = across * 2.0 ** ((1.0 - np.minimum(e2, 1.0)) / 2.0)
+    around = np.stack([radius, radius, size[:, 2]], axis=1)
+    return np.where(are_round[:, None], around, size), are_round
 
 
 class Clearance(NamedTuple):
@@ -294,14 +322,22 @@ def _base_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
     return tuple(capsules)
 
 
-def _in_hand(held: Held) -> tuple[RobotPart, ...]:
+class _Cylinder(NamedTuple):
+    """A cylinder about its z; the attributes of a `RobotPart`, with half-extents as size [m]."""
+
+    size: tuple[float, float, float]
+    T_frame_primitive: np.ndarray
+    kind: str = "cylinder"
+
+
+def _in_hand(held: Held) -> tuple[RobotPart | _Cylinder, ...]:
     """The held object, in the hand frame."""
     pose = np.array(held.T_gripper_held, float)
     pose[2, 3] += kinematics.FINGER_TIPS
-    return (RobotPart("box", tuple(held.half_size), pose),)
+    return (_Cylinder(held.half_size, pose) if held.round else RobotPart("box", tuple(held.half_size), pose),)
 
 
-def _spheres(bodies: Sequence[tuple[int, tuple[RobotPart, ...]]], cell: float) -> Spheres:
+def _spheres(bodies: Sequence[tuple[int, tuple[RobotPart | _Cylinder, ...]]], cell: float) -> Spheres:
     """Spheres around all primitives of pairs of a frame, ascending, and its primitives."""
     frames, centres, radii, edges = [], [], [], []
     for frame, primitives in bodies:
@@ -329,6 +365,9 @@ def _cover(kind: str, size: tuple[float, ...], cell: float) -> tuple[np.ndarray,
     steps = [2 * s / n for s, n in zip(size, counts, strict=True)]
     axes = [(np.arange(n) - (n - 1) / 2) * step for n, step in zip(counts, steps, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    if kind == "cylinder":
+        inner = np.maximum(np.abs(grid[:, :2]) - np.array(steps[:2]) / 2, 0.0)
+        grid = grid[np.hypot(inner[:, 0], inner[:, 1]) < size[0]]
     return grid, float(np.linalg.norm(steps)) / 2, np.array(steps)
 
 

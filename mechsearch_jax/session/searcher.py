@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
+from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.belief.impasse import hindrance, impasse
 from mechsearch_jax.belief.unseen_motion import expected
@@ -45,7 +46,7 @@ from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.arm_clearance import ArmBody, shows_arm
 from mechsearch_jax.robot.arm_config import check_joints
-from mechsearch_jax.robot.hand import checked_width
+from mechsearch_jax.robot.hand import HandConfig, checked_width
 from mechsearch_jax.robot.motion import motion_with
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
@@ -55,8 +56,8 @@ from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
 from mechsearch_jax.session.preparing import Preparing, first_decision, nothing_seen, program
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
-from mechsearch_jax.session.step import Motion, Present, SearchStep, View, display_image, motion_of
-from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, way_out
+from mechsearch_jax.session.step import TRIES, Motion, Present, SearchStep, View, display_image, motion_of, times
+from mechsearch_jax.session.whole_trajectory import PUT_BACK, WITHDRAW, TrajectoryConfig, way_back, way_out
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.sight import check_camera
 
@@ -315,8 +316,7 @@ class Searcher:
         warnings += faults.belief_warnings(now.belief, state.belief, shelf_is_empty=EMPTY_SHELF in unseen)
         learned = self._learned(before, observation)
         trials = self._trials if learned is None else learned.trials([0])
-        held = self._held(present)
-        first = held or self._way_out(observation, present)
+        first = self._held(observation, present) or self._way_out(observation, present)
         if first is None:
             decided, motion = self._decide(decision_key, trials, state, images.depth, unseen, present)
         else:
@@ -336,9 +336,12 @@ class Searcher:
             problem=problem,
             image=display_image(images.depth, images.colour),
         )
-        # What the hand holds is to be told first; nothing else of this look counts.
-        if held is None:
+        if first is None:
             self._keep(step, learned)
+        elif first.trajectory is not None:
+            # The arm, or what it holds, hides things: nothing else of this look counts.
+            action = now.action if now.acted else no_action()
+            self._state = dataclasses.replace(now, action=action, handed=True, way=first.kind)
         if self._view is not None:
             self._view.decided(step, decided.tried)
             self._shown = step
@@ -427,20 +430,50 @@ class Searcher:
         shown = shows_arm(camera, depth, ArmBody.of(self.problem.gripper.max_opening), joints)
         return np.where(shown, np.float32(np.nan), depth) if shown.any() else depth
 
-    def _held(self, present: Present) -> Motion | None:
-        """No motion, where the fingers have something between them after a grasp that was reported as failed."""
+    def _held(self, observation: Observation, present: Present) -> Motion | None:
+        """What is done with what the fingers hold after a grasp that was reported as failed; None if it is nothing."""
         now, kind = self._now, kind_of(int(self._now.action.kind))
         grasps = now.acted and not now.executed and (kind.takes_target or kind.holds_object)
         opened, width = float(now.action.opening), present.width
         if not grasps or width is None or not EMPTY < width < opened - EMPTY:
             return None
         what = "the target" if kind.takes_target else f"object {int(now.action.object)}"
-        over = "if it is the target, call acted(ok=True), and the search is over; else " if kind.takes_target else ""
-        why = (
-            f"the hand holds something {1000 * width:.0f} mm wide after a grasp of {what} that was reported as failed; "
-            f"{over}take it out of the hand, or open the hand where it may fall, and give the new width"
+        held = (
+            f"the hand holds something {1000 * width:.0f} mm wide after a grasp of {what} that was reported as failed"
         )
-        return Motion(kind_of(ActionKind.NONE).name, why, None)
+        try:
+            fault, motion = "", self._with_held(observation, present, width)
+        except InputError as error:
+            fault, motion = f" (it is not moved: {error})", None
+        if motion is not None:
+            return motion._replace(reason=f"{held}: {motion.reason}")
+        over = "if it is the target, call acted(ok=True), and the search is over; else " if kind.takes_target else ""
+        by_hand = "take it out of the hand, or open the hand where it may fall, and give the new width"
+        return Motion(kind_of(ActionKind.NONE).name, f"{held}{fault}; {over}{by_hand}", None)
+
+    def _with_held(self, observation: Observation, present: Present, width: float) -> Motion | None:
+        """The motion out of the shelf with what the hand holds, or outside, back to where it stood; None for a target,
+        and for what was not put back once.
+
+        Raises:
+          InputError: there is none, or something else is held.
+        """
+        now, kind = self._now, kind_of(int(self._now.action.kind))
+        config, arm, joints = self._motions, self.workcell.arm, present.joints
+        settings = {"home": np.array(arm.home), "width": width, "speed": arm.speed, "config": config}
+        grasp = grip_for(self.problem, now.observation, now.action).grasp(
+            float(now.action.opening), 0.0, 0.0, config.hand or HandConfig()
+        )
+        if not grasp.width - grasp.inner <= width <= grasp.width + grasp.outer:
+            raise InputError(f"{1000 * grasp.width:.0f} mm were expected")
+        if joints is not None:
+            way = way_out(self.problem, now.observation, joints, holding=now.action, **settings)
+            if way is not None:
+                return Motion(WITHDRAW, "first straight back, out of the shelf and home, with it", way)
+        if kind.takes_target or times(now.failures, np.asarray(now.action.T_world_gripper)[:3, 3]) >= TRIES:
+            return None
+        back = way_back(self.problem, now.observation, now.action, observation, joints=joints, **settings)
+        return Motion(PUT_BACK, "back to where it stood", back)
 
     def _way_out(self, observation: Observation, present: Present) -> Motion | None:
         """The motion out of the shelf, where the hand is inside of it; None where it is not."""
@@ -462,7 +495,7 @@ class Searcher:
         if trajectory is None:
             return None
         why = "the hand is inside the shelf: first straight back, out and home, with the fingers as they are"
-        return Motion("withdraw", why, trajectory)
+        return Motion(WITHDRAW, why, trajectory)
 
     def _decide(
         self,
@@ -475,15 +508,17 @@ class Searcher:
     ) -> tuple[Decided, Motion]:
         """A decision and its motion, drawn anew where the arm cannot execute it."""
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
+        refused = self._now.refusals
+        # Where no place was found that is clear enough, less has to do.
+        config = dataclasses.replace(self._motions, beside=self._motions.beside / (1 + refused))
 
         def executable(decision: Decision) -> bool:
             belief, observation = state.belief, state.observation
-            settings = unseen, present, arm, self._motions, self._now.failures
+            settings = unseen, present, arm, config, self._now.failures
             motions.append(motion_of(problem, belief, observation, decision, depth, *settings))
             return not motions[-1].blocked
 
         last = self._now.index >= self.config.max_steps
-        refused = self._now.refusals
         decided = decide(self._policy, trials, key, problem, state, last=last, refusals=refused, executable=executable)
         return decided, self._within_limit(motions[-1], state)
 
@@ -519,7 +554,8 @@ class Searcher:
         Args:
           ok: whether it was executed to its end. A retrieval that was finishes the search; trials that learn do so from
             other actions that were. A retrieval that was reported as failed, after which the target is in the hand
-            nevertheless, may be reported again.
+            nevertheless, may be reported again. After a way out of the shelf, or the way back of an object, what was
+            reported of the action before it still holds.
           joints: where the arm stopped, seven angles [rad], if that is not where the motion ends: `next` takes it to be
             there unless it is told otherwise, and takes it out of the shelf first.
 
@@ -531,20 +567,21 @@ class Searcher:
         if not (now.handed or (ok and now.acted and not now.executed and kind.takes_target)):
             raise InputError("acted: no motion was handed out since the last one; call next first")
         failures = now.failures
-        if kind.takes_target or kind.holds_object:
+        if (kind.takes_target or kind.holds_object) and not (now.way and (ok or now.way == WITHDRAW)):
             place = tuple(np.asarray(now.action.T_world_gripper, float)[:3, 3].tolist())
             failures = () if ok else (*failures, place)
         self._state = dataclasses.replace(
             now,
-            # The way out of the shelf is no action.
-            index=now.index + (now.handed and kind.code != ActionKind.NONE),
+            # The way out of the shelf, or back, is no action.
+            index=now.index + (now.handed and not now.way and kind.code != ActionKind.NONE),
             handed=False,
             acted=True,
-            executed=ok,
-            finished=ok and kind.takes_target,
+            executed=now.executed if now.way else ok,
+            finished=ok and kind.takes_target and not now.way,
             refusals=0,
             failures=failures,
             stopped=() if stopped is None else tuple(stopped.tolist()),
+            way="",
         )
         if self._view is not None and self._shown is not None:
             self._view.acted(self._shown, ok)

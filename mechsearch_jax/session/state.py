@@ -41,6 +41,7 @@ class State:
       refusals: number of steps without a motion since the last action.
       executed: whether that action was executed to its end.
       failures: places of the gripper in grasps that failed since the last one that did not, [m].
+      way: name of the motion that was returned, where it only clears the hand after `action`; else empty.
       stopped: joint angles at which the last motion was broken off [rad]; empty if it was not, or that is not known.
       hypothesis_probabilities: what trials that learn hold of each hypothesis by its name, see
         `planner.learning.LearnsFriction`; empty if they do not learn, or have not yet.
@@ -57,6 +58,7 @@ class State:
     executed: bool = True
     failures: tuple[tuple[float, ...], ...] = ()
     stopped: tuple[float, ...] = ()
+    way: str = ""
     hypothesis_probabilities: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
@@ -69,10 +71,11 @@ _PLAIN: dict[str, Callable[[Any], Any]] = {
     "executed": bool,
     "failures": lambda places: tuple(tuple(map(float, place)) for place in places),
     "stopped": lambda joints: tuple(map(float, joints)),
+    "way": str,
     "hypothesis_probabilities": lambda values: {str(name): float(value) for name, value in values.items()},
 }
 # What states hold that were saved before these fields existed.
-_ADDED: dict[str, Any] = {"executed": True, "failures": (), "stopped": (), "hypothesis_probabilities": {}}
+_ADDED: dict[str, Any] = {"executed": True, "failures": (), "stopped": (), "way": "", "hypothesis_probabilities": {}}
 _PYTREES = ("belief", "observation", "action")
 
 

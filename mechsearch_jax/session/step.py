@@ -21,6 +21,7 @@ from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import TriedActions
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.robot.arm_clearance import ALWAYS
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
@@ -78,7 +79,8 @@ class SearchStep:
     Attributes:
       index: number of actions taken before.
       kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" if no action is possible or all
-        that were tried do harm.
+        that were tried do harm; "withdraw" for a hand that first leaves the shelf, and "put-back" for one that first
+        puts back what it holds.
       reason: what to do and what for, or why nothing can be done, in one line.
       warnings: inconsistencies in the images or the belief, a line each.
       trajectory: the motion from the present joints through the action and home; None without an action.
@@ -114,7 +116,7 @@ class SearchStep:
         action, found = self.decision.action, bool(self.belief.found)
         kind, moves = kind_of(int(action.kind)), self.trajectory is not None
         possible = np.asarray(self.belief.exists)
-        # The way out of the shelf is no action.
+        # The way out of the shelf, or back, is no action.
         what = self.kind if kind.code == ActionKind.NONE else kind.describe(action, objects.capacity)
         return Frame(
             title=f"{self.index + 1}  {what if moves else 'nothing to be done'}",
@@ -209,7 +211,7 @@ def motion_of(
         why = f"no gain is expected of what could be done; {hindrance(problem, belief, observation.objects)}"
         return Motion(nothing, f"{target}; {why}", None, blocked=True)
     place = np.asarray(decision.action.T_world_gripper)[:3, 3]
-    if (kind.takes_target or kind.holds_object) and _times(failures, place) >= TRIES:
+    if (kind.takes_target or kind.holds_object) and times(failures, place) >= TRIES:
         return refused(f"{TRIES} grasps failed at this place; see why, and mend that or move it by hand")
     if sweeps_unmeasured(problem, belief, observation.objects, decision.action):
         return refused(UNMEASURED)
@@ -237,7 +239,9 @@ def motion_of(
         warnings = (f"the hand, or the target in it, will brush {brushed} on its way",) if brushed else ()
         return Motion(kind.name, f"{target}; {verb}: {known}", trajectory, warnings=warnings)
     cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
-    return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory)
+    touched = [near.body for near in trajectory.nearest if near.distance <= 0.0 and near.body not in ALWAYS]
+    warnings = (f"the hand, or what it holds, may touch {' and '.join(touched)}",) if touched else ()
+    return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory, warnings=warnings)
 
 
 def gains(decision: Decision) -> bool:
@@ -246,7 +250,7 @@ def gains(decision: Decision) -> bool:
     return not min(best, float(decision.predicted_cost)) >= cost - GAIN * abs(cost) or cost == 0.0
 
 
-def _times(failures: tuple[tuple[float, ...], ...], place: np.ndarray) -> int:
+def times(failures: tuple[tuple[float, ...], ...], place: np.ndarray) -> int:
     """How many failures were at a place."""
     return sum(float(np.linalg.norm(np.subtract(failure, place))) < SAME_PLACE for failure in failures)
 

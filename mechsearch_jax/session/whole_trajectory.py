@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, Protocol
 
 import jax
@@ -22,7 +23,10 @@ from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import (
+    ALWAYS,
+    FARTHEST,
     HAND_FRAME,
+    SHELF,
     TARGET,
     ArmBody,
     Held,
@@ -41,7 +45,7 @@ from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference, motion_with
 from mechsearch_jax.robot.nearest import nearest_rows
 from mechsearch_jax.robot.robot_trajectory import Bounds, Nearest, Part, RobotTrajectory, derivatives
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session.placing import PlaceWay, place_ways
 from mechsearch_jax.workspace.obstacle import Obstacle
@@ -49,9 +53,16 @@ from mechsearch_jax.workspace.target_view import body_at
 
 # Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
 OUTSIDE = 2e-3
-# How far a joint may be from where inverse kinematics has it [rad], and how much nearer to the shelf than where it is
+# How far a joint may be from where inverse kinematics has it [rad], and how much nearer to anything than where it is
 # the arm may come on its way out [m].
 AT_REST, NEARER = 0.02, 0.005
+# Names of the motions that clear the hand before the search goes on.
+WITHDRAW, PUT_BACK = "withdraw", "put-back"
+# By how much what is held may have turned between the pads when it is put down [rad]: held off its centre, a box of
+# 0.35 kg turned by up to 5 degrees in MuJoCo, and a corner that meets the board stops the arm.
+SAG = math.radians(5)
+# Least confidence of an object by which the distance kept from it is divided.
+LEAST_SURE = 0.3
 
 
 class Setting(recogniser.Setting, Protocol):
@@ -72,6 +83,8 @@ class TrajectoryConfig:
       doubt: when recognition is too doubtful to move.
       hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
       place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
+      beside: how far hand and held object keep from other objects as they put one down, divided by how sure these are
+        [m]; a `Searcher` takes less, a half, a third and so on, after looks at which nothing could be done.
       without_gain: whether a `Searcher` also hands out motions of which no lower cost is expected.
       obstacles: what else the arm keeps clear of; a `Searcher` adds its workcell's, the camera's body among them.
     """
@@ -82,11 +95,13 @@ class TrajectoryConfig:
     doubt: DoubtConfig = dataclasses.field(default_factory=DoubtConfig)
     hand: HandConfig | None = None
     place: tuple[float, ...] = ()
+    beside: float = 0.01
     without_gain: bool = False
     obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self):
         check_place("TrajectoryConfig: place", self.place)
+        check_range("TrajectoryConfig: beside", self.beside, 0.0, FARTHEST, "m")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -121,6 +136,10 @@ def whole_trajectory(
     puts the target down at `config.place`; if there is none, or it cannot, it brings the target home, or stops outside
     the shelf if the target would hit something at home. The trajectory of no action is the way home.
 
+    As it puts an object down, the hand and what it holds keep `config.beside`, divided by the other object's
+    confidence, from each other object, and the hand stays out of the shelf's margins; the object is let go as high as a
+    corner may hang if it turns between the fingers.
+
     The fingers move as a real hand does: what it does is in `events`, and the arm stands still where one has to have
     ended. The first, which opens or closes them for the action, is there whatever `width` is.
 
@@ -140,7 +159,7 @@ def whole_trajectory(
 
     Raises:
       InputError: an argument is impossible, recognition is too doubtful, the arm does not reach all of the action, or
-        touches an obstacle in it, or the way to it or home is blocked.
+        touches an obstacle in it, comes too near to an object as it puts one down, or the way to it or home is blocked.
     """
     config, observation = config or TrajectoryConfig(), observation.with_boxes()
     home = np.array(HOME if home is None else home, float)
@@ -169,6 +188,7 @@ def way_out(
     width: float | None = None,
     speed: float = 1.0,
     config: TrajectoryConfig | None = None,
+    holding: Action | None = None,
 ) -> RobotTrajectory | None:
     """The trajectory of a hand inside the shelf straight back, out and home, with its fingers as they are; None for a
     hand outside. Not to be called inside `jit`.
@@ -176,17 +196,49 @@ def way_out(
     Args:
       problem, observation, home, width, speed, config: as of `whole_trajectory`.
       joints: present joint angles [rad].
+      holding: the action in which the hand grasped what it holds, if anything, as `observation` has it.
 
     Raises:
-      InputError: the arm does not follow that way in its present configuration, or comes nearer to the shelf on it; or
-        the way home is blocked.
+      InputError: the arm does not follow that way in its present configuration, or comes nearer to the shelf on it,
+        with something in the hand also to an object; or the way home is blocked.
     """
     config = config or TrajectoryConfig()
     home = np.array(HOME if home is None else home, float)
     if tip_positions(joints[None])[0, 0] <= problem.gripper.nearest_outside + OUTSIDE:
         return None
-    making = _Assembly(problem, observation.with_boxes(), no_action(), None, config, speed)
+    making = _Assembly(problem, observation.with_boxes(), holding or no_action(), None, config, speed)
     return making.out(joints, home, problem.gripper.max_opening if width is None else width)
+
+
+@in_own_settings
+def way_back(
+    problem: Setting,
+    observation: Observation,
+    action: Action,
+    now: Observation,
+    *,
+    joints: Any = None,
+    home: Any = None,
+    width: float,
+    speed: float = 1.0,
+    config: TrajectoryConfig | None = None,
+) -> RobotTrajectory:
+    """The trajectory of a hand outside the shelf that holds an object: it puts it back where it grasped it, and goes
+    home. Not to be called inside `jit`.
+
+    Args:
+      problem, joints, home, width, speed, config: as of `whole_trajectory`.
+      observation, action: the action in which the hand grasped the object, and what was observed before it.
+      now: the present observation.
+
+    Raises:
+      InputError: the arm does not reach that place, something stands there now, or the way there or home is blocked.
+    """
+    config = config or TrajectoryConfig()
+    home = np.array(HOME if home is None else home, float)
+    joints = home if joints is None else np.array(joints, float)
+    making = _Assembly(problem, observation.with_boxes(), action, None, config, speed)
+    return making.back(joints, home, width, now.with_boxes().objects)
 
 
 class _Assembly:
@@ -222,6 +274,7 @@ class _Assembly:
         grip = grip_for(self.problem, self.observation, self.action)
         stages.append(_Stage(Part.ACTION, acting(reference, grip, self.motion, self.hand, self.speed)))
         self._check_obstacles(stages[-1])
+        self._check_placing(stages[-1])
         between = self._between(stages[-1].rows)
 
         fault, at_home = "", True
@@ -238,33 +291,76 @@ class _Assembly:
 
     def out(self, joints: np.ndarray, home: np.ndarray, width: float) -> RobotTrajectory:
         """`way_out`."""
-        gripper, arm = self.problem.gripper, self.motion.gripper.arm
         T = np.array(link_poses(joints[None])[0, HAND_FRAME], float)
         T[:3, 3] = tip_positions(joints[None])[0]
-        waypoints = self.motion.waypoints
-        way, follows, _ = ways_in(jnp.asarray(T), jnp.float32(joints[6]), gripper, waypoints, waypoints)
-        q = np.array(way, float)[::-1]
+        q, follows = self._straight_in(T, joints[6])
+        q = q[::-1]
         if not follows or np.abs(q[0] - joints).max() > AT_REST:
             raise InputError("withdraw: the arm cannot follow a straight way out of the shelf; take it out by hand")
         q[0] = joints
-        body, known = ArmBody.of(width), self.config.obstacles
-        fixed = Obstacles.of(self.problem.shelf, (), self.config.free.floor, bodies=known)
+        holds, known = self.kind.holds_object or self.kind.takes_target, self.config.obstacles
+        body, around = ArmBody.of(width, self._held() if holds else None), self._around
+        # A hand that holds nothing goes where it came from, between objects.
+        fixed = around if holds else Obstacles.of(self.problem.shelf, (), self.config.free.floor, bodies=known)
         each = clearance(body, fixed, q).each
         touches = np.flatnonzero((each < np.minimum(each[:1], 0.0) - NEARER).any(axis=0))
         if len(touches):
             what = fixed.names[touches[0]]
             raise InputError(f"withdraw: on a straight way out the arm would touch {what}; take it out by hand")
-        # What is the same pose twice would have no direction.
-        apart = np.concatenate([[True], np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-6])
-        pace = self.speed * self.motion.carry_pace
-        rows = timed_rows(respaced(q[apart], WAYPOINTS), self.motion.timestep, pace, arm=arm)
-        still = np.full(len(rows), width)
-        back = self._free("the way home", rows[-1], home, body, self._obstacles())
-        stages = [
-            _Stage(Part.WAY_HOME, Rows(rows, still, np.zeros(len(rows)))),
-            self._travel(Part.WAY_HOME, back, width),
+        force, pace = (self.hand.force, self.motion.carry_pace) if holds else (0.0, 1.0)
+        out = self._timed(q, width, force)
+        back = self._free("the way home", out.position[-1], home, body, around, pace=pace)
+        stages = [_Stage(Part.WAY_HOME, out), self._travel(Part.WAY_HOME, back, width, force)]
+        return dataclasses.replace(self._joined(joints, width, stages, True), action=WITHDRAW)
+
+    def back(self, joints: np.ndarray, home: np.ndarray, width: float, now: Superquadrics) -> RobotTrajectory:
+        """`way_back`."""
+        T, opened, name = np.array(self.action.T_world_gripper, float), float(self.action.opening), self._acted_on
+        T[2, 3] += self.motion.clearance + self._sag()
+        q, follows = self._straight_in(T, self.action.q7)
+        if not follows:
+            raise InputError("the arm does not reach its place")
+        held = ArmBody.of(width, self._held())
+        there = self._free("the way to its place", joints, q[0], held, self._around, pace=self.motion.carry_pace)
+        parts = [
+            self._timed(q, width, self.hand.force),
+            opening_to(q[-1], width, opened, self.hand, self.motion.timestep),
         ]
-        return dataclasses.replace(self._joined(joints, width, stages, True), action="withdraw")
+        parts.append(self._timed(q[::-1], opened, 0.0))
+        action = _Stage(Part.ACTION, joined(parts, self.motion.timestep))
+        seen = Obstacles.of(self.problem.shelf, (now,), self.config.free.floor)
+        near = [(each.body, each.distance) for each in self._nearest([action])[0]]
+        near += [(body, distance) for body, distance, _ in nearest_rows(held, seen, q)]
+        meets = [body for body, distance in near if body not in ALWAYS and distance < -NEARER]
+        if meets:
+            raise InputError(f"on the way to its place the hand, or {name} in it, would touch {meets[0]}")
+        back = self._free("the way home", q[0], home, ArmBody.of(opened), self._around)
+        stages = [
+            self._travel(Part.WAY_THERE, there, width, self.hand.force),
+            action,
+            self._travel(Part.WAY_HOME, back, opened),
+        ]
+        return dataclasses.replace(self._joined(joints, width, stages, True), action=PUT_BACK)
+
+    @property
+    def _around(self) -> Obstacles:
+        """What was observed, without what the hand holds."""
+        holds = self.kind.holds_object or self.kind.takes_target
+        return self._obstacles(without=int(self.action.object) if holds else None)
+
+    def _straight_in(self, T: np.ndarray, q7: Any) -> tuple[np.ndarray, bool]:
+        """Joint angles of the way in to a pose of the gripper [rad], no two alike, and whether the arm follows it."""
+        waypoints, gripper = self.motion.waypoints, self.problem.gripper
+        way, follows, _ = ways_in(jnp.asarray(T, jnp.float32), jnp.float32(q7), gripper, waypoints, waypoints)
+        q = np.array(way, float)
+        # What is the same pose twice would have no direction.
+        return q[np.concatenate([np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-6, [True]])], bool(follows)
+
+    def _timed(self, q: np.ndarray, width: float, force: float) -> Rows:
+        """Rows along joint angles, from rest to rest with resting fingers, at the pace with something in the hand."""
+        pace, timestep = self.speed * self.motion.carry_pace, self.motion.timestep
+        rows = timed_rows(respaced(q, WAYPOINTS), timestep, pace, arm=self.motion.gripper.arm)
+        return Rows(rows, np.full(len(rows), width), np.full(len(rows), force))
 
     def _way_there(self, joints: np.ndarray, end: np.ndarray, before: float, after: float, least: float) -> _Stage:
         """The way to where the action begins, while the fingers move from one distance to another."""
@@ -345,7 +441,10 @@ class _Assembly:
         ]
 
     def _reference(self) -> Reference | None:
-        motion = reference_motion(self.kind, self.action, self.motion)
+        action = self.action
+        if self.kind.holds_object:
+            action = action.replace(T_world_place=jnp.asarray(action.T_world_place).at[2, 3].add(self._sag()))
+        motion = reference_motion(self.kind, action, self.motion)
         if motion is None:
             return None
         reference, reachable = motion
@@ -391,7 +490,16 @@ class _Assembly:
     def _held(self) -> Held:
         """What the closed hand holds; a target that is not visible is assumed between the fingers."""
         what = grasped(self.problem, self.observation, self.action)
-        return Held(np.linalg.inv(np.asarray(self.action.T_world_gripper, float)) @ what.T_world_object, what.size)
+        T_gripper_world = np.linalg.inv(np.asarray(self.action.T_world_gripper, float))
+        return Held.of(T_gripper_world @ what.T_world_object, what.size, what.exponents)
+
+    def _sag(self) -> float:
+        """How much lower a corner of the held object may hang, which turns about the closing direction [m]."""
+        what, T = grasped(self.problem, self.observation, self.action), np.asarray(self.action.T_world_gripper, float)
+        across = np.cross(T[:3, 1], [0.0, 0.0, 1.0])
+        pose = what.T_world_object
+        reach = abs(across @ (pose[:3, 3] - T[:3, 3])) + np.abs(across @ pose[:3, :3]) @ np.array(what.size)
+        return float(reach) * math.sin(SAG)
 
     def _free(
         self,
@@ -464,6 +572,30 @@ class _Assembly:
         if touches:
             name, depth = touches[0].body, -1000 * touches[0].distance
             raise InputError(f"{self.kind.name}: the arm would pass {depth:.0f} mm through {name}; decide anew")
+
+    def _check_placing(self, action: _Stage) -> None:
+        """Check that hand and held object keep clear of what stands beside, and of the shelf, as they put it down.
+
+        Raises:
+          InputError: they do not.
+        """
+        acted, carried, keep = action.rows, int(self.action.object), self.config.beside
+        x, holds = tip_positions(acted.position)[:, 0], acted.force > 0.0
+        outside = np.flatnonzero((x <= self.problem.gripper.nearest_outside + OUTSIDE) & holds)
+        if not (self.kind.holds_object and len(outside)):
+            return
+        sure = np.asarray(self.observation.judged().confidence, float)
+        beside = {f"object {i}": keep / max(share, LEAST_SURE) for i, share in enumerate(sure) if i != carried}
+        # The shelf has margins of its own.
+        least = {TARGET: keep, SHELF: 0.0, **beside}
+        placing = np.arange(outside[-1], len(x))
+        for phase, rows in ((1, placing[holds[placing]]), (2, placing[~holds[placing]])):
+            for name, distance, _ in self._nearest_rows(action, phase, rows):
+                if distance < least.get(name, -np.inf):
+                    raise InputError(
+                        f"{self.kind.name}: where it puts object {carried} down, the hand or what it holds would be "
+                        f"{1000 * distance:.0f} mm from {name}, not {1000 * least[name]:.0f} mm or more; decide anew"
+                    )
 
     def _nearest(self, stages: list[_Stage]) -> tuple[tuple[Nearest, ...], tuple[Nearest, ...]]:
         """How near the stages come to everything, and to what the action is for while it lasts, the nearest first."""

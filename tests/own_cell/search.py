@@ -18,6 +18,8 @@ LOOKS = 3
 TOUCH, BESIDE = 5.0, 0.04
 # A search that does not end has failed.
 MOST_MOTIONS = 24
+# Motions that are no actions.
+CLEARING = ("withdraw", "put-back")
 
 
 def run(layout, seed, target, arm, folder, force=None, film=False):
@@ -75,7 +77,7 @@ def run(layout, seed, target, arm, folder, force=None, film=False):
             if refused > LOOKS:
                 return end(f"refused: {note['reason']}")
             continue
-        refused, motions, actions = 0, motions + 1, actions + (step.kind != "withdraw")
+        refused, motions, actions = 0, motions + 1, actions + (step.kind not in CLEARING)
         path = files / f"{motions:02d}.csv"
         save_csv(step.trajectory, path, overwrite=True)
         note["limits"], note["shares"] = limits.faults(path, arm, cell.joints)
@@ -142,6 +144,8 @@ def told(step, cell):
     if action:
         slots = {o["slot"]: o["is"] for o in objects}
         of = "target" if kind == "retrieve" else slots.get(action["object"], "target")
+    if kind in CLEARING:
+        of = next(iter(execution.held_things(cell)), None)
     cost, expected = values["cost"], values["predicted_cost"]
     moves = step.trajectory is not None and kind in ("push", "pick-and-place")
     target = values["target"]
