@@ -461,7 +461,10 @@ class Searcher:
         unseen: tuple[str, ...],
         present: Present,
     ) -> tuple[Decided, Motion]:
-        """A decision and its motion, drawn anew where the arm cannot execute it."""
+        """A decision and its motion, drawn anew where the arm cannot execute it.
+
+        Where no gain is expected it looks one action farther ahead: what is in the way may have to be cleared first.
+        """
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
 
         def executable(decision: Decision) -> bool:
@@ -471,8 +474,15 @@ class Searcher:
             return not motions[-1].blocked
 
         last = self._now.index >= self.config.max_steps
-        refused = self._now.refusals
-        decided = decide(self._policy, trials, key, problem, state, last=last, refusals=refused, executable=executable)
+        arguments, refused = (trials, key, problem, state), self._now.refusals
+        farther = self._policy.farther if isinstance(self._policy, PlanningPolicy) else None
+
+        def enough(decision: Decision) -> bool:
+            return executable(decision) or (motions[-1].idle and farther is not None)
+
+        decided = decide(self._policy, *arguments, last=last, refusals=refused, executable=enough)
+        if motions[-1].idle and farther is not None:
+            decided = decide(farther, *arguments, last=last, refusals=refused, executable=executable)
         return decided, self._within_limit(motions[-1], state)
 
     @property

@@ -142,7 +142,7 @@ def told(step, cell):
     if action:
         slots = {o["slot"]: o["is"] for o in objects}
         of = "target" if kind == "retrieve" else slots.get(action["object"], "target")
-    cost, expected = values["cost"], values["predicted_cost"]
+    cost, expected = values["cost"], values["least_cost"]
     moves = step.trajectory is not None and kind in ("push", "pick-and-place")
     target = values["target"]
     return {
