@@ -20,8 +20,8 @@ class GraspConfig:
         also limits grasps of round objects, and how a hand puts things down.
       yaw_step: largest angle between neighbouring approach directions to round objects [rad]; boxes are grasped square
         to their faces.
-      turn: by how much a box is also approached from either side of square [rad]; it turns in the hand as the fingers
-        close. 0 for square approaches alone.
+      turn: by how much a box is also approached from either side of square [rad]; as the fingers close it turns in the
+        hand, or is held at two edges. 0 for square approaches alone.
       tilts: angles by which the gripper points downwards [rad].
       wrists: angles of joint 7 relative to 45 degrees [rad]; each places link 6 differently beside the hand.
       height: height of the grasp above the target's centre [m]; higher grasps keep the wrist clear of the board.
