@@ -16,6 +16,7 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 
@@ -106,7 +107,7 @@ def test_a_wide_target_is_refused_with_what_would_do():
     with pytest.raises(InputError, match="waypoints"):
         GraspConfig(waypoints=1)
     assert GraspConfig(max_yaw=1.571).max_yaw == 1.571
-    for wrong in ({"max_yaw": 1.7}, {"max_yaw": np.nan}, {"yaw_step": 0.0}, {"tilts": ()}):
+    for wrong in ({"max_yaw": 1.7}, {"max_yaw": np.nan}, {"yaw_step": 0.0}, {"tilts": ()}, {"turn": 0.8}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             GraspConfig(**wrong)
 
@@ -122,6 +123,45 @@ def test_directions_are_no_farther_apart_than_their_step():
     # As many within 45 degrees as the sets of grasps of the paper's preset always had.
     dense = GraspConfig.dense()
     assert (dense.yaws, dataclasses.replace(dense, max_yaw=np.radians(45)).yaws) == (41, 25)
+
+
+@pytest.mark.parametrize("half", [(0.0225, 0.0175), (0.024, 0.035), (0.033, 0.02), (0.026, 0.024)])
+def test_a_box_is_also_grasped_turned_from_square_where_it_fits_in_the_hand(half):
+    config = GraspConfig(tilts=(0.3,), wrists=(0.0,), points=256, turn=np.radians(20))
+    tables = graspability.grasp_tables(Gripper(), Target("box", (*half, 0.05)), config)
+    yaw = np.degrees(np.arctan2(*np.asarray(tables.T_target_gripper, float)[:, 1::-1, 2].T))
+    grasps = {(round(y) % 360, bool(t)) for y, t in zip(yaw, np.asarray(tables.turned), strict=True)}
+    corners = np.array([(x, y) for x in (-half[0], half[0]) for y in (-half[1], half[1])])
+    expected = {(yaw, False) for yaw in (0, 90, 180, 270)}
+    for angle in (*range(20, 380, 90), *range(70, 430, 90)):
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        along, across = corners @ [c, s], corners @ [-s, c]
+        if np.ptp(across) <= Gripper().usable_opening and along.max() <= 0.033:
+            expected.add((angle % 360, True))
+    assert grasps == expected
+
+
+def test_only_boxes_are_grasped_turned_and_only_where_that_is_wanted():
+    turned = [
+        np.asarray(graspability.grasp_tables(Gripper(), target, config).turned).any()
+        for target in (Target(), Target("box"))
+        for config in (
+            GraspConfig(points=256, yaw_step=1.0),
+            GraspConfig(points=256, yaw_step=1.0, turn=np.radians(20)),
+        )
+    ]
+    assert turned == [False, False, False, True]
+
+
+def test_a_box_at_a_wall_is_grasped_turned_and_one_in_the_middle_square():
+    config = GraspConfig(tilts=(np.radians(25),), turn=np.radians(20), points=512, target_points=128)
+    box = target_grasps(Shelf(), Gripper(), Target("box"), config)
+    for pose, by in (((0.6, 0.05, -0.25), 0.0), ((0.6, -0.193, 0.7), 20.0)):
+        grasp = best_grasp(box, superquadric.empty(8), jnp.float32(pose))
+        assert bool(grasp.success)
+        x, y, _ = np.asarray(grasp.action.T_world_gripper, float)[:3, 2]
+        from_square = (np.degrees(np.arctan2(y, x) - pose[2]) + 45.0) % 90.0 - 45.0
+        assert abs(from_square) == pytest.approx(by, abs=1e-3)
 
 
 def test_what_the_target_sweeps_is_the_target_and_its_way():

@@ -300,8 +300,8 @@ def test_what_is_in_the_way_alone_matters_most():
 def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
     rng = np.random.default_rng(0)
     n = root.scene.capacity
-    given = jax.jit(propagate_blame)
-    for chance in (0.1, 0.5, 0.8):
+    given = jax.jit(propagate_blame, static_argnames="partly")
+    for chance, partly in ((0.1, False), (0.5, False), (0.8, False), (0.1, True)):
         by_kind = [
             w.replace(reached=rng.random(w.reached.shape) < 0.05, hits=rng.random(w.hits.shape) < chance)
             for w in root.candidates
@@ -314,17 +314,17 @@ def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
                 hits_of[i] += [
                     hits for hits, at in zip(kind.hits[i], kind.reached[i], strict=True) if can[i] and at.any()
                 ]
-        expected, stuck = (
-            share.astype(float),
-            np.array([able[:, i].any() and all(map(np.any, w)) for i, w in enumerate(hits_of)]),
-        )
+        blocked = np.array([np.mean(list(map(np.any, w))) if w else 1.0 for w in hits_of])
+        expected = share.astype(float)
+        stuck = np.where(able.any(axis=0), blocked if partly else blocked == 1.0, 0.0)
         for _ in range(DEPTH):
-            held, expected = np.where(stuck, expected, 0.0), np.where(stuck, 0.0, expected)
+            held, expected = stuck * expected, (1.0 - stuck) * expected
             for i in np.flatnonzero(stuck):
                 blames = sum((np.where(hits, ALONE ** (1.0 - hits.sum()), 0.0) for hits in hits_of[i]), np.zeros(n))
                 expected += held[i] * blames / max(blames.sum(), 1e-12)
-        np.testing.assert_allclose(given(state, jnp.float32(share)), expected, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(given(state, jnp.float32(share), partly), expected, rtol=1e-4, atol=1e-6)
         assert chance < 0.8 or stuck.any()
+        assert not partly or ((stuck > 0.0) & (stuck < 1.0)).any()
 
 
 def test_draws_go_to_what_hides_the_target(decision, root, problem):

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, grab
-from test_search import CAMERA, IMAGES, TRUSTING, searcher_of, seen
+from test_search import CAMERA, IMAGES, TRUSTING, one_push, searcher_of, seen
 
+from mechsearch_jax import planner
 from mechsearch_jax.actions import Action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
@@ -58,6 +59,27 @@ def test_nothing_is_moved_without_an_expected_gain_unless_that_is_wanted(problem
         not in searcher_of(problem, HIDDEN, policy=costly(11.0, 11.0), trajectories=bold).next(IMAGES.depth).reason
     )
     assert gains(costly(11.0, 10.0)(jax.random.key(0), problem, initial_belief(problem), seen(HIDDEN)))
+
+
+def test_where_no_action_gains_anything_it_looks_one_farther(problem):
+    """And says what is expected: nothing of the first action, but of what it makes possible."""
+    push, horizons = one_push(problem), []
+
+    def plan(rollout, key, objects):
+        horizons.append(rollout.config.horizon)
+        decision = push(rollout, key, objects)
+        cost = jnp.broadcast_to(jnp.float32([9.0, 4.0][: rollout.config.horizon]), decision.sequences.cost.shape)
+        sequences = decision.sequences.replace(cost=cost)
+        return decision.replace(predicted_cost=jnp.float32(9.0), sequences=sequences)
+
+    policy = planner.search_for_grasp(sequences=4).replace(plan=plan)
+    step = searcher_of(problem, HIDDEN, policy=policy).next(IMAGES.depth)
+    assert horizons == [1, 2]
+    assert step.kind == "push"
+    assert "cost 9, 9 expected afterwards, 4 after what it makes possible" in step.reason
+    assert step.to_json()["least_cost"] == 4.0
+    assert policy.farther.farther.config.horizon == 3
+    assert policy.replace(propose=len).farther.propose is len
 
 
 def test_what_blocks_a_target_in_sight_is_named(problem):

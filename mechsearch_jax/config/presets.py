@@ -39,7 +39,7 @@ def paper(**changes: Any) -> Config:
     problem = ProblemConfig(
         existence=ExistenceConfig(as_in_paper=True),
         grasps=GraspConfig(tilts=tilts),
-        retrieval=dataclasses.replace(GraspConfig.dense(), tilts=tilts, max_yaw=max_yaw),
+        retrieval=dataclasses.replace(GraspConfig.dense(), tilts=tilts, max_yaw=max_yaw, turn=0.0),
         actions=ActionConfig(as_in_paper=True, grasps=ObjectGraspConfig(tilts=tilts, max_yaw=max_yaw)),
     )
     planner = PlannerConfig(as_in_paper=True, unseen_contact_penalty=0.0, guided_fraction=0.0, crowding_weight=0.0)

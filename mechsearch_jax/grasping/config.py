@@ -20,6 +20,8 @@ class GraspConfig:
         also limits grasps of round objects, and how a hand puts things down.
       yaw_step: largest angle between neighbouring approach directions to round objects [rad]; boxes are grasped square
         to their faces.
+      turn: by how much a box is also approached from either side of square [rad]; as the fingers close it turns in the
+        hand, or is held at two edges. 0 for square approaches alone.
       tilts: angles by which the gripper points downwards [rad].
       wrists: angles of joint 7 relative to 45 degrees [rad]; each places link 6 differently beside the hand.
       height: height of the grasp above the target's centre [m]; higher grasps keep the wrist clear of the board.
@@ -34,6 +36,7 @@ class GraspConfig:
 
     max_yaw: float = math.radians(45)
     yaw_step: float = math.radians(15)
+    turn: float = 0.0
     tilts: tuple[float, ...] = (math.radians(20), math.radians(25), math.radians(30))
     wrists: tuple[float, ...] = (math.radians(-60), 0.0, math.radians(60))
     height: float = 0.03
@@ -51,6 +54,8 @@ class GraspConfig:
             raise InputError(f"GraspConfig: max_yaw {self.max_yaw} must be from 0 to {LARGEST_YAW:.4f} rad")
         if not self.yaw_step > 0:
             raise InputError(f"GraspConfig: yaw_step {self.yaw_step} must be above 0")
+        if not 0 <= self.turn < math.pi / 4:
+            raise InputError(f"GraspConfig: turn {self.turn} must be from 0 to below {math.pi / 4:.4f} rad")
         if self.antipodal < 0:
             raise InputError(f"GraspConfig: antipodal {self.antipodal} must not be negative")
         if self.waypoints < 2:
@@ -71,6 +76,7 @@ class GraspConfig:
         return cls(
             max_yaw=math.radians(75),
             yaw_step=math.radians(3.75),
+            turn=math.radians(20),
             tilts=angles(20.0, 25.0, 30.0),
             wrists=angles(-60.0, -30.0, 0.0, 30.0, 60.0),
             antipodal=600,

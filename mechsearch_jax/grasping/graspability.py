@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from mechsearch_jax.actions.kinds.object_grasps import PALM
 from mechsearch_jax.geometry.collision import Clouds, collisions, dense_clouds
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
@@ -60,6 +61,7 @@ class GraspTables(PyTreeNode):
       T_target_gripper: pose of the gripper where it closes, shape (G, 4, 4).
       q7: angle of joint 7 in each grasp [rad], shape (G,).
       wrist: index of the wrist's swept gripper cloud, shape (G,).
+      turned: whether the approach is turned from square to a flat side, see `GraspConfig.turn`, shape (G,).
       ahead: least cosine of the angle between the approach and +x, seen from above, shape (G,).
       swept: the G clouds of points that gripper and target sweep in each grasp, in the gripper's frame.
       still_gripper: points on the open gripper with each wrist, in its own frame, shape (W, 3, S).
@@ -69,6 +71,7 @@ class GraspTables(PyTreeNode):
     T_target_gripper: jax.Array
     q7: jax.Array
     wrist: jax.Array
+    turned: jax.Array
     ahead: jax.Array
     swept: Clouds
     still_gripper: jax.Array
@@ -94,12 +97,14 @@ class CandidateGrasps(GraspTables):
 
 
 class _Grasps(NamedTuple):
-    """Grasps of a target, the index of the wrist of each, the angles of the wrists [rad], and the room for grasps."""
+    """Grasps of a target, the index of the wrist of each, the angles of the wrists [rad], the room for grasps, and
+    those that are turned from square."""
 
     T_target_gripper: Float[Array, "g 4 4"]
     wrist: Int[np.ndarray, " g"]
     wrists: tuple[float, ...]
     room: int
+    turned: Bool[np.ndarray, " g"]
 
 
 def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig) -> _Grasps:
@@ -110,18 +115,33 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig) -> _Gr
     """
     if target.compound is not None:
         return _compound_grasps(target, target.compound, gripper, config)
-    yaws, widths = shape_of(target.shape).grasps(target.half_size, config.yaws, config.max_yaw)
+    shape = shape_of(target.shape)
+    yaws, widths = shape.grasps(target.half_size, config.yaws, config.max_yaw)
     yaws = yaws[widths <= gripper.usable_opening]
     if len(yaws) == 0:
         raise InputError(
             f"Target: {min(widths):.3f} m wide, but the gripper takes {gripper.usable_opening} m; use a thinner target"
         )
+    square = len(yaws)
+    if config.turn and not shape.round:
+        yaws = np.append(yaws, _turned(yaws, target.half_size, gripper, config.turn))
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
     yaw, tilt = grasps[:, :2].T.astype(np.float32)
     wrist = grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
     above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
-    return _Grasps(_posed(yaw, tilt, above), wrist, config.wrists, len(wrist))
+    turned = np.repeat(np.arange(len(yaws)) >= square, len(wrist) // len(yaws))
+    return _Grasps(_posed(yaw, tilt, above), wrist, config.wrists, len(wrist), turned)
+
+
+def _turned(
+    yaws: Float[np.ndarray, " y"], half_size: tuple[float, float, float], gripper: Gripper, turn: float
+) -> Float[np.ndarray, " t"]:
+    """The yaws turned to either side by an angle [rad], where the box fits between fingers and palm all the same."""
+    yaws = np.concatenate([yaws - turn, yaws + turn])
+    x, y = half_size[:2]
+    across, along = np.abs([[np.sin(yaws), np.cos(yaws)], [np.cos(yaws), np.sin(yaws)]]).swapaxes(1, 2) @ [x, y]
+    return yaws[(2 * across <= gripper.usable_opening) & (along <= PALM)]
 
 
 def _posed(yaw: np.ndarray, tilt: np.ndarray, point: np.ndarray) -> Float[Array, "g 4 4"]:
@@ -137,7 +157,7 @@ def _compound_grasps(target: Target, compound: Compound, gripper: Gripper, confi
         yaws = directions.tolist() if target.solid.round else None
         T, wrist = level_grasps(compound, gripper, yaws, config.tilts, len(config.wrists), config.height)
         if len(T):
-            return _Grasps(jnp.asarray(T, jnp.float32), wrist, config.wrists, room)
+            return _Grasps(jnp.asarray(T, jnp.float32), wrist, config.wrists, room, np.zeros(room, bool))
     # Of one that looks alike at every yaw grasps about +x do.
     widest = config.max_yaw if target.solid.round else math.pi
     T, wrist = antipodal_grasps(compound, gripper, room, widest)
@@ -146,7 +166,7 @@ def _compound_grasps(target: Target, compound: Compound, gripper: Gripper, confi
             f"Target: the gripper fits nowhere: it takes {gripper.usable_opening} m between two opposite sides that its"
             " open fingers reach from the side or from above; use another target"
         )
-    return _Grasps(jnp.asarray(T, jnp.float32), wrist, WRISTS, room)
+    return _Grasps(jnp.asarray(T, jnp.float32), wrist, WRISTS, room, np.zeros(room, bool))
 
 
 def feasible_grasps(
@@ -177,7 +197,7 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     Raises:
       InputError: the target is too wide for the gripper.
     """
-    T_target_gripper, wrist, wrists, room = _target_grasps(target, gripper, config)
+    T_target_gripper, wrist, wrists, room, turned = _target_grasps(target, gripper, config)
     count = len(wrist)
     if target.is_compound:
         T_target_gripper, wrist = filled_up(T_target_gripper, wrist, room)
@@ -205,6 +225,7 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
         "T_target_gripper": T_target_gripper,
         "q7": np.asarray(angles, np.float32)[wrist],
         "wrist": np.int32(wrist),
+        "turned": turned,
         # Approaches at the limit count.
         "ahead": np.full(len(wrist), math.cos(config.max_yaw + 1e-4), np.float32),
         "swept": jax.tree.map(lambda a: a[filled], of_grasps),

@@ -55,6 +55,8 @@ CLEARANCES = (0.004, 0.008, 0.012, 0.02)
 DEPTHS = (0.006, 0.012, 0.024)
 # Two grasps are alike if their approaches and their angles of joint 7 differ by less than these [rad].
 ALIKE, ALIKE_WRIST = math.radians(10), math.radians(20)
+# What a grasp that is turned from square ranks behind others that hit as many objects, whatever their clearance.
+TURNED = 50
 # Larger than the rank of any grasp that arm and shelf allow.
 FAR = 1_000_000
 
@@ -106,7 +108,7 @@ class GraspChoice(PyTreeNode):
       feasible: whether arm and shelf allow the grasp.
       hits: number of objects that the grasp hits; `graspability.INFEASIBLE` if it is not feasible.
       action: the retrieval with the grasp; the best grasp is the one with the most clearance on its straight way among
-        those with the fewest hits.
+        those with the fewest hits, square ones first.
     """
 
     success: jax.Array
@@ -149,7 +151,7 @@ def joined(sets: Sequence[TargetGrasps]) -> TargetGrasps:
     before = np.cumsum([0, *(len(table.still_gripper) for table in tables)])
     fields: dict[str, Any] = {
         name: jax.tree.map(lambda *a: jnp.concatenate(a), *(getattr(table, name) for table in tables))
-        for name in ("T_target_gripper", "q7", "ahead", "swept", "still_gripper")
+        for name in ("T_target_gripper", "q7", "turned", "ahead", "swept", "still_gripper")
     }
     wrist = jnp.concatenate([table.wrist + np.int32(start) for table, start in zip(tables, before, strict=False)])
     return first.replace(tables=GraspTables(**fields, wrist=wrist, still_target=tables[0].still_target))
@@ -382,7 +384,7 @@ def _ranked(
 
     all_hits, *deeper = jax.lax.map(hit, jnp.float32((0.0, *depths)))
     hits = jnp.where(found.feasible, all_hits, INFEASIBLE)
-    crowd = jnp.sum(jax.lax.map(near, jnp.float32(CLEARANCES)), axis=0)
+    crowd = jnp.sum(jax.lax.map(near, jnp.float32(CLEARANCES)), axis=0) + TURNED * tables.turned
     # Infeasible grasps come last, even after those marked as alike.
     order = jnp.where(found.feasible, 1000 * sum(deeper, jnp.zeros_like(hits)) + 100 * hits + crowd, 10 * FAR)
     T_world_gripper = compose(T_world_target[None], tables.T_target_gripper)

@@ -29,7 +29,7 @@ from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, top_grasp
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
-from mechsearch_jax.planner.proposal import Propose, guided_draw
+from mechsearch_jax.planner.proposal import Propose, farther_draw, guided_draw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import concatenate, grasps_to_try, sequences_to_try
@@ -116,6 +116,13 @@ class PlanningPolicy(PyTreeNode):
     def grasps(self) -> CachedJit:
         """Ranks the grasps of a found target: `retrieval.top_grasps` where grasps are tried, else `best_grasp`."""
         return top_grasps if self.tries else best_grasp
+
+    @property
+    def farther(self) -> PlanningPolicy:
+        """The policy for where no action gains anything: it looks one action farther ahead, and draws guided by what
+        is in the way of any action on an object, though others are possible. A program of its own."""
+        propose = farther_draw if self.propose == guided_draw else self.propose
+        return self.replace(config=dataclasses.replace(self.config, horizon=self.config.horizon + 1), propose=propose)
 
     @property
     def _planning(self) -> PlanningPolicy:

@@ -104,7 +104,7 @@ def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Ar
     return total / jnp.maximum(jnp.sum(total), 1e-12)
 
 
-def propagate_blame(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
+def propagate_blame(state: State, share: Float[Array, " n"], partly: bool = False) -> Float[Array, " n"]:
     """Pass the share of each object that cannot be moved yet on to the objects that its candidate actions hit.
 
     Repeated `DEPTH` times. The share of an object without any reachable candidate is lost.
@@ -112,27 +112,37 @@ def propagate_blame(state: State, share: Float[Array, " n"]) -> Float[Array, " n
     Args:
       state: a state with its candidate actions.
       share: share of each object, shape (N,).
+      partly: whether an object that can be moved passes on as much of its share as of its candidates hit something.
     """
     reached = [
         jnp.any(c.reached, axis=-1) & able[:, None] for c, able in zip(state.candidates, state.able, strict=True)
     ]
     reachable, hits = jnp.concatenate(reached, axis=1), jnp.concatenate([c.hits for c in state.candidates], axis=1)
-    stuck = ~jnp.any(reachable & ~jnp.any(hits, axis=-1), axis=1) & jnp.any(state.able, axis=0)
+    free = reachable & ~jnp.any(hits, axis=-1)
+    passed = ~jnp.any(free, axis=1)
+    if partly:
+        passed = 1.0 - jnp.sum(free, axis=1) / jnp.maximum(jnp.sum(reachable, axis=1), 1)
+    passed = jnp.where(jnp.any(state.able, axis=0), passed, 0.0)
     in_the_way = jax.vmap(blame)(hits, reachable)
     for _ in range(DEPTH):
-        given = jnp.where(stuck, share, 0.0)
+        given = passed * share
         share = share - given + jnp.sum(given[:, None] * in_the_way, axis=0)
     return share
 
 
 def sampling_weights(
-    problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
+    problem: Problem,
+    belief: Belief,
+    objective: Objective,
+    guided_fraction: Array | float,
+    state: State,
+    partly: bool = False,
 ) -> Float[Array, " n"]:
     """Sampling weight of each object: partly even, partly by what it hides, which grasps it blocks, and which objects
     that do so it keeps from being moved.
 
     A found target that may be pushed counts as one more blocker of each of its blocked grasps; if no grasp is feasible,
-    it is the only blocker.
+    it is the only blocker. `partly` is that of `propagate_blame`.
     """
     rows = pairs(problem.grasps, belief.grasps.feasible)
     counts = rows.allowed & objective.needs_graspability(belief, state)[rows.pose]
@@ -141,10 +151,18 @@ def sampling_weights(
     blocks = blame(state.hits | (blocked[:, None] & target[None]), counts)
     blocks = jnp.where(jnp.any(counts), blocks, target)
     hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
-    share = propagate_blame(state, blocks + hides)
+    share = propagate_blame(state, blocks + hides, partly)
     share = share / jnp.maximum(jnp.sum(share), 1e-12)
     return (1.0 - guided_fraction) / EVEN + guided_fraction * share
 
 
-# The default `Propose`: draws go to objects by `sampling_weights`.
+def farther_weights(
+    problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
+) -> Float[Array, " n"]:
+    """`sampling_weights` for where no single action gains anything: not even of what can be moved already."""
+    return sampling_weights(problem, belief, objective, guided_fraction, state, partly=True)
+
+
+# The default `Propose`: draws go to objects by `sampling_weights`; and the one that looks farther ahead.
 guided_draw = WeightedDraw(sampling_weights)
+farther_draw = WeightedDraw(farther_weights)

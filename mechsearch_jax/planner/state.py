@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.candidates import AllCandidates
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
@@ -113,3 +113,8 @@ class Decision(PyTreeNode):
     sequences: Sequences
     refused: jax.Array | int = 0
     alternatives: Alternatives | None = None
+
+    @property
+    def least_cost(self) -> Float[Array, ""]:
+        """The least J that is predicted after the action, or after later ones of its sequence."""
+        return jnp.minimum(self.predicted_cost, jnp.min(self.sequences.cost[0]))

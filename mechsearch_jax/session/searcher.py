@@ -506,7 +506,10 @@ class Searcher:
         unseen: tuple[str, ...],
         present: Present,
     ) -> tuple[Decided, Motion]:
-        """A decision and its motion, drawn anew where the arm cannot execute it."""
+        """A decision and its motion, drawn anew where the arm cannot execute it.
+
+        Where no gain is expected it looks one action farther ahead: what is in the way may have to be cleared first.
+        """
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
         refused = self._now.refusals
         # Where no place was found that is clear enough, less has to do.
@@ -519,7 +522,15 @@ class Searcher:
             return not motions[-1].blocked
 
         last = self._now.index >= self.config.max_steps
-        decided = decide(self._policy, trials, key, problem, state, last=last, refusals=refused, executable=executable)
+        arguments = trials, key, problem, state
+        farther = self._policy.farther if isinstance(self._policy, PlanningPolicy) else None
+
+        def enough(decision: Decision) -> bool:
+            return executable(decision) or (motions[-1].idle and farther is not None)
+
+        decided = decide(self._policy, *arguments, last=last, refusals=refused, executable=enough)
+        if motions[-1].idle and farther is not None:
+            decided = decide(farther, *arguments, last=last, refusals=refused, executable=executable)
         return decided, self._within_limit(motions[-1], state)
 
     @property

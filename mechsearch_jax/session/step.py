@@ -150,6 +150,7 @@ class Motion(NamedTuple):
       trajectory: of the arm; None if nothing is done.
       blocked: whether the action is not to be made; another one may be possible.
       warnings: what it is known to do beside what it is for, a line each.
+      idle: whether it is not made because no gain is expected of it.
     """
 
     kind: str
@@ -157,6 +158,7 @@ class Motion(NamedTuple):
     trajectory: RobotTrajectory | None
     blocked: bool = False
     warnings: tuple[str, ...] = ()
+    idle: bool = False
 
 
 class Present(NamedTuple):
@@ -209,7 +211,7 @@ def motion_of(
 
     if not kind.takes_target and not config.without_gain and not gains(decision):
         why = f"no gain is expected of what could be done; {hindrance(problem, belief, observation.objects)}"
-        return Motion(nothing, f"{target}; {why}", None, blocked=True)
+        return Motion(nothing, f"{target}; {why}", None, blocked=True, idle=True)
     place = np.asarray(decision.action.T_world_gripper)[:3, 3]
     if (kind.takes_target or kind.holds_object) and times(failures, place) >= TRIES:
         return refused(f"{TRIES} grasps failed at this place; see why, and mend that or move it by hand")
@@ -238,7 +240,10 @@ def motion_of(
         known = f"a grasp that takes it out is known{brushed and '; it will brush '}{brushed}"
         warnings = (f"the hand, or the target in it, will brush {brushed} on its way",) if brushed else ()
         return Motion(kind.name, f"{target}; {verb}: {known}", trajectory, warnings=warnings)
-    cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
+    now, then, best = float(decision.cost), float(decision.predicted_cost), float(decision.least_cost)
+    cost = f"cost {now:.0f}, {then:.0f} expected afterwards"
+    if best < then - GAIN * abs(now):
+        cost += f", {best:.0f} after what it makes possible"
     touched = [near.body for near in trajectory.nearest if near.distance <= 0.0 and near.body not in ALWAYS]
     warnings = (f"the hand, or what it holds, may touch {' and '.join(touched)}",) if touched else ()
     return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory, warnings=warnings)
@@ -246,8 +251,8 @@ def motion_of(
 
 def gains(decision: Decision) -> bool:
     """Whether a lower cost is expected after a decision's action, or after actions that it begins."""
-    cost, best = float(decision.cost), float(jnp.min(decision.sequences.cost[0]))
-    return not min(best, float(decision.predicted_cost)) >= cost - GAIN * abs(cost) or cost == 0.0
+    cost = float(decision.cost)
+    return not float(decision.least_cost) >= cost - GAIN * abs(cost) or cost == 0.0
 
 
 def times(failures: tuple[tuple[float, ...], ...], place: np.ndarray) -> int:

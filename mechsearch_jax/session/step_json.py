@@ -35,6 +35,7 @@ def step_json(step: SearchStep) -> dict[str, Any]:
         "motion": dataclasses.asdict(step.trajectory.report()) if step.trajectory is not None else None,
         "cost": _number(step.decision.cost),
         "predicted_cost": _number(step.decision.predicted_cost),
+        "least_cost": _number(step.decision.least_cost),
         "poses": int(np.sum(np.asarray(step.belief.exists))),
         "found": bool(step.belief.found),
         "objects": _objects(step),

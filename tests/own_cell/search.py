@@ -146,7 +146,7 @@ def told(step, cell):
         of = "target" if kind == "retrieve" else slots.get(action["object"], "target")
     if kind in CLEARING:
         of = next(iter(execution.held_things(cell)), None)
-    cost, expected = values["cost"], values["predicted_cost"]
+    cost, expected = values["cost"], values["least_cost"]
     moves = step.trajectory is not None and kind in ("push", "pick-and-place")
     target = values["target"]
     return {
