@@ -35,8 +35,9 @@ Function = Callable[[Array], Array]
 TINY = 1e-30
 # Tolerance for rounding in comparisons of the gauge.
 ROUNDING = 1e-4
-# Points of a cloud in one step, a power of 2, and warps of 32 threads that share it.
-POINTS, WARPS = 256, 2
+# Points of a cloud in one step, a power of 2, and warps of 32 threads that share it: one, since every warp repeats what
+# concerns the whole cloud.
+POINTS, WARPS = 256, 1
 # Largest number of placed clouds of a program, a power of 2, and the number of programs below which it is smaller. A
 # GPU begins a program in about a nanosecond, and one with fewer placed clouds is done sooner.
 PLACED, PROGRAMS = 64, 2**17
