@@ -80,7 +80,7 @@ def test_what_is_no_option_tells_methods_apart_too():
     unusual = {name: value for name, value in method.options().items() if "." in name}
     assert unusual.pop("problem.existence.found_pixels") == 80
     assert unusual.pop("problem.retrieval.yaw_step") == 0.5
-    assert set(unusual) == {f"problem.retrieval.{name}" for name in ("wrists", "antipodal", "max_yaw")}
+    assert set(unusual) == {f"problem.retrieval.{name}" for name in ("wrists", "antipodal", "max_yaw", "turn")}
     assert Method.of_options(method.options()) == method
 
 
