@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import transform_rows
-from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.errors import InputError, check_range, shown
 from mechsearch_jax.workspace.leaves import are_given
 
 # Largest coordinate, and largest thickness of a board [m].
@@ -103,7 +103,7 @@ class Shelf:
         if not any(isinstance(face, str) for face in self.faces) and len(self.faces) == len(FACES):
             return tuple(name for name, is_there in zip(FACES, self.faces, strict=True) if is_there)
         if isinstance(self.faces, str) or not set(self.faces) <= set(FACES):
-            raise InputError(f"Shelf: faces {self.faces!r} must be a list of those there are of {', '.join(FACES)}")
+            raise InputError(f"Shelf: faces {shown(self.faces)} must be a list of those there are of {', '.join(FACES)}")
         return tuple(name for name in FACES if name in self.faces)
 
     @property
