@@ -103,7 +103,8 @@ class Shelf:
         if not any(isinstance(face, str) for face in self.faces) and len(self.faces) == len(FACES):
             return tuple(name for name, is_there in zip(FACES, self.faces, strict=True) if is_there)
         if isinstance(self.faces, str) or not set(self.faces) <= set(FACES):
-            raise InputError(f"Shelf: faces {shown(self.faces)} must be a list of those there are of {', '.join(FACES)}")
+            known = ", ".join(FACES)
+            raise InputError(f"Shelf: faces {shown(self.faces)} must be a list of those there are of {known}")
         return tuple(name for name in FACES if name in self.faces)
 
     @property
