@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from own_cell import camera, execution, limits, setup, summary, world
+from own_cell import camera, execution, limits, search, setup, summary, world
 
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.robot.kinematics import forward_kinematics
@@ -81,6 +81,33 @@ def test_the_configuration_is_read(tmp_path):
     for target in ("box", "cylinder"):
         (tmp_path / "cell.toml").write_text(setup.configuration(target))
         assert load_settings(tmp_path / "cell.toml").workcell.camera.width == camera.WIDTH
+
+
+def test_only_what_no_motion_is_for_counts_as_a_contact():
+    forces = {
+        ("left finger", "can"): 60.0,
+        ("can (held)", "shelf below"): 12.0,
+        ("tin (held)", "shelf below"): 7.0,
+        ("hand", "box"): 30.0,
+        ("hand", "tin"): 30.0,
+        ("can (held)", "shelf"): 6.0,
+        ("hand", "target"): 4.0,
+    }
+    note = {
+        "reason": "pick object 4",
+        "warnings": ["the hand, or what it holds, may touch object 2 (3 mm beside it) and the target (1 mm into it)"],
+        "of": "can",
+        "objects": [{"slot": 2, "is": "box"}, {"slot": 4, "is": "can"}, {"slot": 0, "is": "tin"}],
+    }
+    done = execution.Executed(forces=forces)
+    assert search.unannounced(note, done) == {
+        "tin (held)|shelf below": 7.0,
+        "hand|tin": 30.0,
+        "can (held)|shelf": 6.0,
+    }
+    # What is shoved against its board is no longer put down.
+    done.forces["can (held)", "shelf below"] = 40.0
+    assert search.unannounced(note, done)["can (held)|shelf below"] == 40.0
 
 
 def test_intervals_are_wilsons():

@@ -5,8 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mechsearch_jax.actions.kinds.nothing import no_action
+from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.belief.unseen_motion import expected
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty, standard_edges
-from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.geometry.transforms import make, yaw_rotation
 from mechsearch_jax.images.cloud import above_board, thinned_view
 from mechsearch_jax.images.detection import BESIDE, TARGET_POINTS, fitted_pose, other_yaw, steady_pose, turned_by
 from mechsearch_jax.images.labels import CAPACITY, FREE
@@ -65,13 +68,16 @@ def sure(*values):
 
 
 def fuse(image, now, before, labels=None):
-    """What becomes of boxes and confidences of this look and of the one before."""
+    """What becomes of boxes and confidences of this look and of the one before, which may be an observation."""
     zeros, labels = jnp.zeros(CAPACITY), image.labels if labels is None else jnp.asarray(labels)
     found = standard_edges(objects(*now[0]))
     fitted = Fitted(
         found, jnp.zeros(3), sure(*now[1]), Measures(found.valid, *[zeros] * 4), labels, jnp.zeros(CAPACITY, bool)
     )
-    earlier = Observation(objects(*before[0]), jnp.array(False), jnp.zeros(3), sure(*before[1]))
+    if isinstance(before, Observation):
+        earlier = before
+    else:
+        earlier = Observation(objects(*before[0]), jnp.array(False), jnp.zeros(3), sure(*before[1]))
     settings = jnp.array(False), VIEW.camera, SHELF, TARGET
     return fitted, fused(jax.random.key(0), fitted, earlier, image.replace(labels=labels), *settings)
 
@@ -130,6 +136,41 @@ def test_what_this_look_contradicts_is_not_kept(image, before):
     fitted, after = fuse(image, ([DEEP, OTHER_BOX], [0.8, 0.95]), before)
     for name in ("objects", "confidence", "labels", "changed"):
         jax.tree.map(np.testing.assert_array_equal, getattr(after, name), getattr(fitted, name))
+
+
+# Low, right behind the carton as the camera sees it.
+BEHIND = ((0.02, 0.02, 0.03), 0.075, 0.05, 0.1)
+
+
+def test_what_is_hidden_now_stands_where_it_stood(image):
+    now = ([CARTON, OTHER_BOX], [0.9, 0.95])
+    fitted, after = fuse(image, now, ([CARTON, OTHER_BOX, BEHIND], [0.8, 0.8, 0.3]))
+    assert np.flatnonzero(after.objects.valid).tolist() == [0, 1, 2]
+    np.testing.assert_allclose(after.objects.position[2], objects(BEHIND).position[0], atol=1e-6)
+    np.testing.assert_allclose(after.confidence[:3], [0.9, 0.95, 0.3], atol=1e-6)
+    np.testing.assert_array_equal(after.labels, fitted.labels)
+    # In another slot where its own is taken.
+    _, moved_on = fuse(image, now, ([BEHIND], [0.3]))
+    np.testing.assert_allclose(moved_on.objects.size[2], BEHIND[0], atol=1e-6)
+    # Where it would be seen, or stands something else that is seen, it is not.
+    for gone in (moved(BEHIND, y=-0.09), moved(BEHIND, x=-0.04)):
+        assert np.flatnonzero(fuse(image, now, ([gone], [0.3]))[1].objects.valid).tolist() == [0, 1]
+
+
+def test_what_was_carried_away_is_not_remembered_where_it_stood(image):
+    """As a `Searcher` expects it after `acted(ok=True)`, where its old place is hidden."""
+    was = Observation(objects(CARTON, OTHER_BOX, BEHIND), jnp.array(False), jnp.zeros(3), sure(0.8, 0.8, 0.3))
+    place = was.objects.position[2]
+    pick = no_action().replace(
+        kind=jnp.int32(ActionKind.PICK_AND_PLACE),
+        object=jnp.int32(2),
+        T_world_gripper=make(jnp.eye(3), place),
+        T_world_place=make(jnp.eye(3), place - jnp.float32([0.0, 0.14, 0.0])),
+    )
+    now = [CARTON, OTHER_BOX], [0.9, 0.95]
+    for action, stands in ((no_action(), [0, 1, 2]), (pick, [0, 1])):
+        _, after = fuse(image, now, expected(was, action))
+        assert np.flatnonzero(after.objects.valid).tolist() == stands
 
 
 def noisy_image(body, seed):

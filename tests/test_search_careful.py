@@ -12,6 +12,7 @@ from test_search import CAMERA, IMAGES, TRUSTING, one_push, searcher_of, seen
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import grip_for
 from mechsearch_jax.belief.impasse import hindrance
@@ -26,6 +27,7 @@ from mechsearch_jax.robot.robot_trajectory import Part
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import UNREPORTED, Searcher
 from mechsearch_jax.session.step import gains
+from mechsearch_jax.session.whole_trajectory import way_out
 from mechsearch_jax.workspace.target import Target
 
 
@@ -128,6 +130,26 @@ def test_a_hand_inside_the_shelf_comes_out_first_and_straight(problem):
     searcher.acted()
     after = searcher.next(IMAGES.depth)
     assert (after.kind, after.index) == ("retrieve", 1)
+
+
+def test_a_hand_that_was_stopped_in_a_push_backs_away_from_it_first(problem):
+    """By up to a centimetre against the push, measured with the tip's positions; then as from everywhere."""
+    observation = without(seen(OPEN))
+    joints = inside(searcher_of(problem, OPEN))
+    (tip,) = tip_positions(joints[None])
+    for advanced, backs in ((0.05, 0.01), (0.004, 0.004)):
+        push = no_action().replace(
+            kind=jnp.int32(ActionKind.PUSH),
+            displacement=jnp.float32([0.0, 0.1, 0.0]),
+            T_world_gripper=make(jnp.eye(3), jnp.float32(tip - [0.0, advanced, 0.0])),
+        )
+        tips = tip_positions(way_out(problem, observation, joints, width=0.0, pushing=push).position)
+        straight = tip_positions(way_out(problem, observation, joints, width=0.0).position)
+        np.testing.assert_allclose(tips[0], tip, atol=1e-5)
+        out = int(np.argmax(tips[:, 0] < problem.gripper.nearest_outside))
+        np.testing.assert_allclose(np.min(np.linalg.norm(tips[:out] - tip + [0.0, backs, 0.0], axis=1)), 0.0, atol=1e-3)
+        apart = np.linalg.norm(tips[out // 2 : out, None] - straight[None], axis=-1).min(axis=1)
+        np.testing.assert_allclose(apart, backs, atol=2e-3)
 
 
 def test_what_the_hand_holds_after_a_failed_grasp_is_asked_for_and_not_dropped(problem):

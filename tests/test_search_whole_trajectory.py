@@ -27,6 +27,7 @@ from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part
 from mechsearch_jax.robot.trajectory_files import csv_header, save_csv, save_ros
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.step import touches
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
@@ -202,11 +203,12 @@ def test_an_action_out_of_reach_is_refused():
 HELD, STAND = np.array([0.02, 0.025, 0.06]), (0.58, -0.12)
 
 
-def placed(beside, sure=1.0, height=0.06):
-    """A pick-and-place of object 0, with object 1 so far to the right of its place [m], of which it is so sure."""
+def placed(beside, sure=1.0, height=0.06, of=STAND):
+    """A pick-and-place of object 0, with object 1 so far to the right of its new place, or its old one [m], of which it
+    is so sure."""
     scene = empty(8)
     for i, (place, half) in enumerate(
-        (((*PLACE, HELD[2]), HELD), ((STAND[0], STAND[1] - beside, height), [0.02, 0.02, height]))
+        (((*PLACE, HELD[2]), HELD), ((of[0], of[1] - beside, height), [0.02, 0.02, height]))
     ):
         scene = scene.replace(
             size=scene.size.at[i].set(jnp.float32(half)),
@@ -253,6 +255,31 @@ def test_an_object_is_put_down_clear_of_what_stands_beside():
     with pytest.raises(InputError, match="not 25 mm or more; decide anew"):
         placed(free + 0.005, sure=0.4)
     placed(free + 0.02, sure=0.4)
+
+
+def test_on_its_way_the_hand_passes_at_half_of_that():
+    """Measured at the grasp, as above; the way in is straight, and the open hand nowhere nearer."""
+    T = np.array(grasp(), float)
+    hand = gripper_cloud(Gripper(), 0.08, float(Q7), 20000) @ T[:3, :3].T + T[:3, 3]
+
+    def gap(beside, tall=0.09):
+        past = np.abs(hand - (PLACE[0], PLACE[1] - beside, Shelf().board + tall)) - (0.02, 0.02, tall)
+        return np.linalg.norm(np.maximum(past, 0.0), axis=1).min()
+
+    free = np.array([beside for beside in np.arange(0.07, 0.2, 0.0005) if gap(beside) > 0.005]).min()
+    near = placed(free + 0.004, height=0.09, of=PLACE)
+    with pytest.raises(
+        InputError, match=r"on its way the hand or what it holds would be \d+ mm from object 1, not 5 mm"
+    ):
+        placed(free - 0.002, height=0.09, of=PLACE)
+    with pytest.raises(InputError, match="not 12 mm or more; decide anew"):
+        placed(free + 0.004, sure=0.4, height=0.09, of=PLACE)
+    # What comes near is said: the nearer, the surer one has to be.
+    sure = dataclasses.replace(seen(), confidence=jnp.full(8, 0.99))
+    assert touches(near, sure) == ()
+    (warning,) = touches(near, dataclasses.replace(seen(), confidence=jnp.full(8, 0.4)))
+    distance = {each.body: each.distance for each in near.nearest}["object 1"]
+    assert warning == f"the hand, or what it holds, may touch object 1 ({1000 * distance:.0f} mm beside it)"
 
 
 def test_an_object_that_turns_between_the_fingers_does_not_meet_the_board():

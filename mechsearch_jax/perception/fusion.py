@@ -5,6 +5,8 @@ is rigid, and mostly stands where it stood: so each object of the last look ente
 as it was, and fitted to this image with its size kept. It takes the place of the objects whose pixels lie on it where
 it was recognised more surely than they are, and explains the image as well: the same points, and no more rays through
 it. What was moved, and so does not lie where it lay, is rejected by points and rays, not by what was planned.
+
+What this image does not show, since something stands before it, is taken to stand where it stood.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.scores import EDGE
 from mechsearch_jax.perception.selection import Costs, explanation_cost, passed, point_cost, sample_of
-from mechsearch_jax.perception.solids import penetrations, surface_distance
+from mechsearch_jax.perception.solids import entries, penetrations, surface_distance
 from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -74,6 +76,7 @@ def fused(
 
     Returns:
       The objects, with the confidence that they were recognised with, and the pixels of those whose place they take.
+      Hidden ones are in slots that this image alone leaves free, their own if it can be.
       `measures` stay those of the image alone.
     """
     slots, now, was, sure = (
@@ -112,7 +115,8 @@ def fused(
     cost = jnp.where(everything.valid[:, None], off, 1.0)
     price = jnp.where(jnp.arange(everything.capacity) == everything.capacity - 1, 0.0, costs.object)
     price = price + passed(everything, sample, costs)
-    overlap = costs.overlap_cost * 100.0 * jnp.maximum(penetrations(everything) - costs.overlap, 0.0)
+    depth = penetrations(everything)
+    overlap = costs.overlap_cost * 100.0 * jnp.maximum(depth - costs.overlap, 0.0)
     table = (cost, price, overlap, sample.weight)
     order, index = jnp.argsort(-sure, stable=True), jnp.arange(everything.capacity)
 
@@ -138,7 +142,20 @@ def fused(
 
     start = everything.valid & ((index < slots) | (index == everything.capacity - 1))
     source, goes_to = jnp.where(now.valid, index[:slots], ABSENT), index[:slots]
-    _, source, goes_to = jax.lax.fori_loop(0, slots, consider, (start, source, goes_to))
+    selected, source, goes_to = jax.lax.fori_loop(0, slots, consider, (start, source, goes_to))
+
+    # Hidden: few rays pass through it, and it is not in what is seen there, which then is the same thing.
+    met = jnp.sum(jnp.isfinite(entries(was, sample.origin, sample.directions)), axis=1) * sample.ray_weight
+    through = price[slots : 2 * slots] - costs.object
+    apart = jnp.where(selected[None], depth[slots : 2 * slots], -jnp.inf)
+    hidden = was.valid & (through <= SLACK + SLACK_SHARE * met) & (jnp.max(apart, axis=1) <= costs.overlap)
+
+    def remember(turn, source):
+        r, free = order[turn], source == ABSENT
+        place = jnp.where(free[r], r, jnp.argmax(free))
+        return jnp.where(hidden[r] & free & (index[:slots] == place), slots + r, source)
+
+    source = jax.lax.fori_loop(0, slots, remember, source)
     # What is replaced stays in its slot as an absent one.
     row = jnp.where(source == ABSENT, index[:slots], source)
     objects = jax.tree.map(lambda a: a[row], everything)

@@ -56,7 +56,18 @@ from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
 from mechsearch_jax.session.preparing import Preparing, first_decision, nothing_seen, program
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
-from mechsearch_jax.session.step import TRIES, Motion, Present, SearchStep, View, display_image, motion_of, times
+from mechsearch_jax.session.step import (
+    TRIES,
+    Motion,
+    Present,
+    SearchStep,
+    View,
+    display_image,
+    motion_of,
+    renamed,
+    times,
+    touches,
+)
 from mechsearch_jax.session.whole_trajectory import PUT_BACK, WITHDRAW, TrajectoryConfig, way_back, way_out
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.sight import check_camera
@@ -445,8 +456,10 @@ class Searcher:
             fault, motion = "", self._with_held(observation, present, width)
         except InputError as error:
             fault, motion = f" (it is not moved: {error})", None
-        if motion is not None:
-            return motion._replace(reason=f"{held}: {motion.reason}")
+        if motion is not None and motion.trajectory is not None:
+            trajectory = renamed(motion.trajectory, now.observation, observation)
+            warnings = touches(trajectory, observation)
+            return motion._replace(reason=f"{held}: {motion.reason}", trajectory=trajectory, warnings=warnings)
         over = "if it is the target, call acted(ok=True), and the search is over; else " if kind.takes_target else ""
         by_hand = "take it out of the hand, or open the hand where it may fall, and give the new width"
         return Motion(kind_of(ActionKind.NONE).name, f"{held}{fault}; {over}{by_hand}", None)
@@ -479,7 +492,8 @@ class Searcher:
         """The motion out of the shelf, where the hand is inside of it; None where it is not."""
         if present.joints is None:
             return None
-        arm = self.workcell.arm
+        arm, action = self.workcell.arm, self._now.action
+        pushed = self._now.acted and not self._now.executed and np.any(np.asarray(action.displacement))
         try:
             trajectory = way_out(
                 self.problem,
@@ -489,13 +503,14 @@ class Searcher:
                 width=present.width,
                 speed=arm.speed,
                 config=self._motions,
+                pushing=action if pushed else None,
             )
         except InputError as error:
             return Motion(kind_of(ActionKind.NONE).name, f"the hand is inside the shelf; {error}", None)
         if trajectory is None:
             return None
         why = "the hand is inside the shelf: first straight back, out and home, with the fingers as they are"
-        return Motion(WITHDRAW, why, trajectory)
+        return Motion(WITHDRAW, why, trajectory, warnings=touches(trajectory, observation))
 
     def _decide(
         self,

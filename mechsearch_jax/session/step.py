@@ -15,18 +15,19 @@ from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief, graspability_map, sweeps_unmeasured
 from mechsearch_jax.belief.impasse import hindrance, impasse
+from mechsearch_jax.belief.unseen_motion import same_objects
 from mechsearch_jax.grasping.retrieval import retrieval_hits
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import TriedActions
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.robot.arm_clearance import ALWAYS
+from mechsearch_jax.robot.arm_clearance import FLOOR, TARGET
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.step_json import step_json
-from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
+from mechsearch_jax.session.whole_trajectory import LEAST_SURE, TrajectoryConfig, whole_trajectory
 from mechsearch_jax.workspace.camera import measured
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ UNMEASURED = (
     "on its way the hand, or what it moves, enters space of which nothing was measured: a thing without depth (black, "
     "shiny, transparent) may stand there; look from elsewhere, or light it otherwise"
 )
+# A motion that comes this near to something may touch it: the arm, what is recognised and the models are no better [m].
+BESIDE = 0.005
 # An action has a gain if the cost is expected to fall by more than this share of it.
 GAIN = 1e-3
 # How often a grasp is tried at a place, and how near another one's place is the same [m].
@@ -239,14 +242,41 @@ def motion_of(
         brushed = " and ".join(f"object {i}" for i in np.flatnonzero(np.asarray(hit)))
         known = f"a grasp that takes it out is known{brushed and '; it will brush '}{brushed}"
         warnings = (f"the hand, or the target in it, will brush {brushed} on its way",) if brushed else ()
+        warnings += touches(trajectory, observation)
         return Motion(kind.name, f"{target}; {verb}: {known}", trajectory, warnings=warnings)
     now, then, best = float(decision.cost), float(decision.predicted_cost), float(decision.least_cost)
     cost = f"cost {now:.0f}, {then:.0f} expected afterwards"
     if best < then - GAIN * abs(now):
         cost += f", {best:.0f} after what it makes possible"
-    touched = [near.body for near in trajectory.nearest if near.distance <= 0.0 and near.body not in ALWAYS]
-    warnings = (f"the hand, or what it holds, may touch {' and '.join(touched)}",) if touched else ()
-    return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory, warnings=warnings)
+    return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory, warnings=touches(trajectory, observation))
+
+
+def touches(trajectory: RobotTrajectory, observation: Observation) -> tuple[str, ...]:
+    """A warning of what a motion may touch beside what it is for, since it comes so near to it; none if nothing is.
+
+    Objects and the target up to `BESIDE`, divided by how sure an object is, and anything that it reaches into.
+    """
+    sure = np.maximum(np.asarray(observation.judged().confidence, float), LEAST_SURE)
+    least = {f"object {i}": BESIDE / share for i, share in enumerate(sure)} | {TARGET: BESIDE, FLOOR: -np.inf}
+    found = [
+        f"{near.body} ({abs(1000 * near.distance):.0f} mm {'beside it' if near.distance > 0.0 else 'into it'})"
+        for near in trajectory.nearest
+        if near.distance <= least.get(near.body, 0.0)
+    ]
+    return (f"the hand, or what it holds, may touch {' and '.join(found)}",) if found else ()
+
+
+def renamed(trajectory: RobotTrajectory, then: Observation, now: Observation) -> RobotTrajectory:
+    """A trajectory that was made of an earlier look, with the names that objects have in this one."""
+    place = np.asarray(then.objects.position)
+    same, matched = (np.asarray(a) for a in same_objects(then.objects, now.objects, then.objects.position))
+    apart = np.linalg.norm(np.asarray(now.objects.position)[same] - place, axis=-1)
+    names = {
+        f"object {i}": f"object {same[i]}" if matched[i] and apart[i] < SAME_PLACE else f"what was object {i}"
+        for i in range(len(place))
+    }
+    nearest = tuple(dataclasses.replace(near, body=names.get(near.body, near.body)) for near in trajectory.nearest)
+    return dataclasses.replace(trajectory, nearest=nearest)
 
 
 def gains(decision: Decision) -> bool:

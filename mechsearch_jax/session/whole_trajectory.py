@@ -53,9 +53,9 @@ from mechsearch_jax.workspace.target_view import body_at
 
 # Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
 OUTSIDE = 2e-3
-# How far a joint may be from where inverse kinematics has it [rad], and how much nearer to anything than where it is
-# the arm may come on its way out [m].
-AT_REST, NEARER = 0.02, 0.005
+# How far a joint may be from where inverse kinematics has it, at rest and a centimetre away [rad], and how much nearer
+# to anything than where it is the arm may come on its way out [m].
+AT_REST, BACKED, NEARER = 0.02, 0.1, 0.005
 # Names of the motions that clear the hand before the search goes on.
 WITHDRAW, PUT_BACK = "withdraw", "put-back"
 # By how much what is held may have turned between the pads when it is put down [rad]: held off its centre, a box of
@@ -63,6 +63,12 @@ WITHDRAW, PUT_BACK = "withdraw", "put-back"
 SAG = math.radians(5)
 # Least confidence of an object by which the distance kept from it is divided.
 LEAST_SURE = 0.3
+# Of the distance kept where something is put down, the share kept elsewhere in an action.
+PASSING = 0.5
+# An object that is predicted to move farther than this is pushed [m].
+MOVED = 1e-3
+# What stands beside what is picked up may come nearer to it by this as it is taken away [m].
+CLOSER = 1e-3
 
 
 class Setting(recogniser.Setting, Protocol):
@@ -84,7 +90,8 @@ class TrajectoryConfig:
       hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
       place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
       beside: how far hand and held object keep from other objects as they put one down, divided by how sure these are
-        [m]; a `Searcher` takes less, a half, a third and so on, after looks at which nothing could be done.
+        [m], and half of it elsewhere in an action that moves an object; a `Searcher` takes less, a half, a third and so
+        on, after looks at which nothing could be done.
       without_gain: whether a `Searcher` also hands out motions of which no lower cost is expected.
       obstacles: what else the arm keeps clear of; a `Searcher` adds its workcell's, the camera's body among them.
     """
@@ -138,7 +145,8 @@ def whole_trajectory(
 
     As it puts an object down, the hand and what it holds keep `config.beside`, divided by the other object's
     confidence, from each other object, and the hand stays out of the shelf's margins; the object is let go as high as a
-    corner may hang if it turns between the fingers.
+    corner may hang if it turns between the fingers. On its way there, and where it pushes, it keeps half of that from
+    what the action is not predicted to move. A retrieval does not: its grasp is the clearest that there is.
 
     The fingers move as a real hand does: what it does is in `events`, and the arm stands still where one has to have
     ended. The first, which opens or closes them for the action, is there whatever `width` is.
@@ -158,8 +166,8 @@ def whole_trajectory(
       config: how it is made; the default if None.
 
     Raises:
-      InputError: an argument is impossible, recognition is too doubtful, the arm does not reach all of the action, or
-        touches an obstacle in it, comes too near to an object as it puts one down, or the way to it or home is blocked.
+      InputError: an argument is impossible, recognition is too doubtful, the arm does not reach all of the action,
+        touches an obstacle in it, or comes too near to what it does not move, or the way to it or home is blocked.
     """
     config, observation = config or TrajectoryConfig(), observation.with_boxes()
     home = np.array(HOME if home is None else home, float)
@@ -189,14 +197,16 @@ def way_out(
     speed: float = 1.0,
     config: TrajectoryConfig | None = None,
     holding: Action | None = None,
+    pushing: Action | None = None,
 ) -> RobotTrajectory | None:
     """The trajectory of a hand inside the shelf straight back, out and home, with its fingers as they are; None for a
-    hand outside. Not to be called inside `jit`.
+    hand outside. Not to be called inside `jit`. From what it pushes it backs away first, as after a push.
 
     Args:
       problem, observation, home, width, speed, config: as of `whole_trajectory`.
       joints: present joint angles [rad].
       holding: the action in which the hand grasped what it holds, if anything, as `observation` has it.
+      pushing: the push in which it stopped, if it did.
 
     Raises:
       InputError: the arm does not follow that way in its present configuration, or comes nearer to the shelf on it,
@@ -204,10 +214,17 @@ def way_out(
     """
     config = config or TrajectoryConfig()
     home = np.array(HOME if home is None else home, float)
-    if tip_positions(joints[None])[0, 0] <= problem.gripper.nearest_outside + OUTSIDE:
+    tip = tip_positions(joints[None])[0]
+    if tip[0] <= problem.gripper.nearest_outside + OUTSIDE:
         return None
     making = _Assembly(problem, observation.with_boxes(), holding or no_action(), None, config, speed)
-    return making.out(joints, home, problem.gripper.max_opening if width is None else width)
+    away = np.zeros(3)
+    if pushing is not None:
+        ahead = np.asarray(pushing.displacement, float)
+        ahead /= np.linalg.norm(ahead)
+        pushed = (tip - np.asarray(pushing.T_world_gripper, float)[:3, 3]) @ ahead
+        away = -np.clip(pushed, 0.0, making.motion.release) * ahead
+    return making.out(joints, home, problem.gripper.max_opening if width is None else width, away)
 
 
 @in_own_settings
@@ -274,7 +291,7 @@ class _Assembly:
         grip = grip_for(self.problem, self.observation, self.action)
         stages.append(_Stage(Part.ACTION, acting(reference, grip, self.motion, self.hand, self.speed)))
         self._check_obstacles(stages[-1])
-        self._check_placing(stages[-1])
+        self._check_beside(stages[-1])
         between = self._between(stages[-1].rows)
 
         fault, at_home = "", True
@@ -289,15 +306,15 @@ class _Assembly:
         stages += [way_home] if way_home is not None else []
         return self._joined(joints, present, stages, at_home, between, fault)
 
-    def out(self, joints: np.ndarray, home: np.ndarray, width: float) -> RobotTrajectory:
-        """`way_out`."""
+    def out(self, joints: np.ndarray, home: np.ndarray, width: float, away: np.ndarray) -> RobotTrajectory:
+        """`way_out`, after a displacement of the hand [m]."""
         T = np.array(link_poses(joints[None])[0, HAND_FRAME], float)
-        T[:3, 3] = tip_positions(joints[None])[0]
+        T[:3, 3] = tip_positions(joints[None])[0] + away
         q, follows = self._straight_in(T, joints[6])
-        q = q[::-1]
-        if not follows or np.abs(q[0] - joints).max() > AT_REST:
+        moves = away.any()
+        if not follows or np.abs(q[-1] - joints).max() > (BACKED if moves else AT_REST):
             raise InputError("withdraw: the arm cannot follow a straight way out of the shelf; take it out by hand")
-        q[0] = joints
+        q = np.concatenate([joints[None], q[::-1][0 if moves else 1 :]])
         holds, known = self.kind.holds_object or self.kind.takes_target, self.config.obstacles
         body, around = ArmBody.of(width, self._held() if holds else None), self._around
         # A hand that holds nothing goes where it came from, between objects.
@@ -573,29 +590,67 @@ class _Assembly:
             name, depth = touches[0].body, -1000 * touches[0].distance
             raise InputError(f"{self.kind.name}: the arm would pass {depth:.0f} mm through {name}; decide anew")
 
-    def _check_placing(self, action: _Stage) -> None:
-        """Check that hand and held object keep clear of what stands beside, and of the shelf, as they put it down.
+    def _check_beside(self, action: _Stage) -> None:
+        """Check that hand and held object keep clear of what the action is not to move; where they put an object down,
+        more, and of the shelf, too.
 
         Raises:
           InputError: they do not.
         """
-        acted, carried, keep = action.rows, int(self.action.object), self.config.beside
-        x, holds = tip_positions(acted.position)[:, 0], acted.force > 0.0
-        outside = np.flatnonzero((x <= self.problem.gripper.nearest_outside + OUTSIDE) & holds)
-        if not (self.kind.holds_object and len(outside)):
+        if not self.kind.moves_object or self.kind.takes_target:
             return
-        sure = np.asarray(self.observation.judged().confidence, float)
-        beside = {f"object {i}": keep / max(share, LEAST_SURE) for i, share in enumerate(sure) if i != carried}
+        acted, carried, keep = action.rows, int(self.action.object), self.config.beside
+        others = np.arange(self.observation.objects.capacity) != carried
+        beside = {f"object {i}": keep / share for i, share in enumerate(self._sure()) if others[i]}
+        if self._acted_on != TARGET:
+            beside[TARGET] = keep
+        x, holds, rows = tip_positions(acted.position)[:, 0], acted.force > 0.0, np.arange(len(acted.width))
+        outside = rows[(x <= self.problem.gripper.nearest_outside + OUTSIDE) & holds]
+        before = rows < outside[-1] if len(outside) else rows >= 0
+        near = f"the hand{' or what it holds' if self.kind.holds_object else ''} would be"
         # The shelf has margins of its own.
-        least = {TARGET: keep, SHELF: 0.0, **beside}
-        placing = np.arange(outside[-1], len(x))
-        for phase, rows in ((1, placing[holds[placing]]), (2, placing[~holds[placing]])):
-            for name, distance, _ in self._nearest_rows(action, phase, rows):
-                if distance < least.get(name, -np.inf):
-                    raise InputError(
-                        f"{self.kind.name}: where it puts object {carried} down, the hand or what it holds would be "
-                        f"{1000 * distance:.0f} mm from {name}, not {1000 * least[name]:.0f} mm or more; decide anew"
-                    )
+        what = f"where it puts object {carried} down, {near}"
+        for phase, part in ((1, rows[~before & holds]), (2, rows[~before & ~holds])):
+            self._keep_clear(action, phase, part, {**beside, SHELF: 0.0}, what)
+        still = {name: PASSING * least for name, least in beside.items() if name not in self._moved()}
+        for phase, part in ((0, rows[before & ~holds]), (1, rows[before & holds])):
+            self._keep_clear(action, phase, part, still, f"on its way {near}", from_start=True)
+
+    def _keep_clear(
+        self, action: _Stage, phase: int, rows: np.ndarray, least: dict[str, float], what: str, from_start: bool = False
+    ) -> None:
+        """Check that rows of a phase keep distances from bodies by their names [m].
+
+        Args:
+          action, phase, rows: of it.
+          least: the distances.
+          what: comes too near, in words.
+          from_start: whether it may come as near as in the first of the rows, and a little nearer.
+
+        Raises:
+          InputError: it comes too near.
+        """
+        if not len(rows):
+            return
+        at_start = {n: d - CLOSER for n, d, _ in self._nearest_rows(action, phase, rows[:1])} if from_start else {}
+        for name, distance, _ in self._nearest_rows(action, phase, rows):
+            if distance < min(least.get(name, -np.inf), at_start.get(name, np.inf)):
+                raise InputError(
+                    f"{self.kind.name}: {what} {1000 * distance:.0f} mm from {name}, not "
+                    f"{1000 * least[name]:.0f} mm or more; decide anew"
+                )
+
+    def _moved(self) -> set[str]:
+        """Names of the objects that the action is predicted to move."""
+        now, after = self.observation.objects, self.after
+        if after is None:
+            return set()
+        shift = np.linalg.norm(np.asarray(after.position, float) - np.asarray(now.position, float), axis=-1)
+        return {f"object {i}" for i in np.flatnonzero(shift > MOVED)}
+
+    def _sure(self) -> np.ndarray:
+        """The confidence of each object, at least `LEAST_SURE`."""
+        return np.maximum(np.asarray(self.observation.judged().confidence, float), LEAST_SURE)
 
     def _nearest(self, stages: list[_Stage]) -> tuple[tuple[Nearest, ...], tuple[Nearest, ...]]:
         """How near the stages come to everything, and to what the action is for while it lasts, the nearest first."""

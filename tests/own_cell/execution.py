@@ -21,6 +21,8 @@ STIFF, DAMP, MOVING_FORCE, REST, REACHED = 4000.0, 80.0, 30.0, 2e-3, 2.5e-3
 SETTLE = 0.6
 # With less force than this at a point, what is held only stands on the board or its stand [N].
 WEIGHT = 5.0
+# What it is pressed on from above with more.
+SUPPORTS = ("shelf below", "stand below")
 # A thing that is let go so far above what is below it is dropped [m].
 DROP = 0.02
 
@@ -125,11 +127,14 @@ class _Watch:
             local = np.zeros(6)
             mujoco.mj_contactForce(world.model, data, i, local)
             force = data.contact.frame[i].reshape(3, 3).T @ local[:3]
-            if not any(robot) and {a, b} & {"shelf", "stand"} and 0.7 * np.linalg.norm(force) < abs(force[2]) < WEIGHT:
-                continue  # what is held stands on something, too
             # MuJoCo's force is the second geom's.
             if robot[0] or (not any(robot) and a in self.held):
                 a, b, force = b, a, -force
+            if not any(robot) and a in ("shelf", "stand") and force[2] > 0.7 * np.linalg.norm(force):
+                if force[2] < WEIGHT:
+                    continue  # what is held stands on something, too
+                # Pressed on it by what grasps or pushes it, or set down.
+                a = f"{a} below"
             pairs = [(b if any(robot) else f"{b} (held)", a)]
             if any(robot) and b != "arm":
                 pairs.append(PULL)

@@ -14,8 +14,10 @@ from . import camera, execution, limits, setup, world
 
 # A refusal is answered by so many further looks.
 LOOKS = 3
-# Contacts beyond this are counted [N], and results are "out" so close to the stand's place [m].
-TOUCH, BESIDE = 5.0, 0.04
+# Contacts beyond this are counted [N], and what is acted on may be pressed on its board or stand with this.
+TOUCH, PRESSED = 5.0, 15.0
+# Results are "out" so close to the stand's place [m].
+BESIDE = 0.04
 # A search that does not end has failed.
 MOST_MOTIONS = 24
 # Motions that are no actions.
@@ -170,19 +172,25 @@ def _yaw(rotation):
 
 
 def unannounced(note, done):
-    """Contacts of more than 5 N that no grasp or push is for, and of which neither reason nor warnings speak."""
+    """Contacts of more than 5 N that no grasp or push is for, and of which neither reason nor warnings speak.
+
+    What is grasped, pushed or put down may be pressed on what is below it with `PRESSED`: that is what the motion is
+    for, but no shove.
+    """
     text = " ".join([note["reason"], *note["warnings"]])
     slots = {o["slot"]: o["is"] for o in note["objects"]}
     named = {
-        slots.get(int(n))
+        {"shelf": "shelf", "target": "target"}.get(what) or slots.get(int(number or -1))
         for part in re.findall(r"(?:brush|touch)\w*([^;.]*)", text)
-        for n in re.findall(r"\bobjects? (\d+)", part)
+        for what, number in re.findall(r"\b(?:the (shelf|target)|objects? (\d+))", part)
     }
     found = {}
     for (one, other), size in done.forces.items():
+        acted_on = one == f"{note['of']} (held)"
         wanted = other == note["of"] and one in ("hand", *execution.FINGERS)
-        carried = one == f"{note['of']} (held)" and other == note["of"]
-        if size > TOUCH and not wanted and not carried and other not in named:
+        carried = acted_on and other == note["of"]
+        most = PRESSED if acted_on and other in execution.SUPPORTS else TOUCH
+        if size > most and not wanted and not carried and other not in named:
             found[f"{one}|{other}"] = round(size, 1)
     return found
 

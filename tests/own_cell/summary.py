@@ -1,6 +1,9 @@
 """What came of searches, as a table of counts with Wilson intervals."""
 
 import math
+import re
+
+from . import execution, search
 
 
 def wilson(hits, of, z=1.96):
@@ -30,6 +33,8 @@ def table(rows):
             len(motions),
             "0",
         ),
+        ("the same, and none pressed on what is below it, either", sum(map(_pressed, motions)), len(motions), ""),
+        ("motions that warn of a contact", sum(map(_warns, motions)), len(motions), ""),
         ("files that a controller would refuse", sum(bool(step["limits"]) for step in motions), len(motions), "0"),
         ("looks refused", len(refused), len(steps), ""),
         ("grasps failed with a thing between the fingers", sum(_wrong(step) for step in motions), len(motions), ""),
@@ -65,6 +70,15 @@ def _wrong(step):
         g["between"] and not g["expected"] - g["inner"] <= g["measured"] <= g["expected"] + g["outer"]
         for g in step["executed"]["grasps"]
     )
+
+
+def _pressed(step):
+    below = [size for pair, size in step["executed"]["forces"].items() if pair.split("|")[1] in execution.SUPPORTS]
+    return bool(step["unannounced"]) or max(below, default=0.0) > search.TOUCH
+
+
+def _warns(step):
+    return any(re.search(r"may touch|will brush", text) for text in [step["reason"], *step["warnings"]])
 
 
 def _stopped(step):

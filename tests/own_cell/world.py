@@ -44,6 +44,9 @@ LINKS = [
 GAINS, DAMPING = [4500, 4500, 3500, 3500, 2000, 2000, 2000], [450, 450, 350, 350, 200, 200, 200]
 EFFORT = [87, 87, 87, 87, 12, 12, 12]
 FINGERTIP = 0.1034
+# Outline of Franka's hand, as its public mesh has it to 3 mm: half depths and widths at heights above the flange [m].
+# It is 63 mm deep at the flange, and 32 to 36 mm at the fingers.
+PALM = [(0.0095, 0.09, -0.026), (0.0316, 0.03, 0), (0.0245, 0.099, 0), (0.018, 0.099, 0.055), (0.016, 0.093, 0.066)]
 GREY = {"arm": "0.92 0.92 0.94", "shelf": "0.8 0.77 0.72"}
 
 
@@ -218,6 +221,10 @@ def _thing_xml(thing):
     return f'<body name="{thing.name}"><freejoint name="{thing.name}"/>{"".join(geoms)}</body>'
 
 
+def _palm():
+    return [v for x, y, z in PALM for a in (x, -x) for b in (y, -y) for v in (a, b, z)]
+
+
 def _arm_xml():
     text = ""
     for i, ((a, alpha, d), (mass, capsules)) in enumerate(zip(DH, LINKS, strict=True)):
@@ -228,7 +235,7 @@ def _arm_xml():
             text += f'<geom class="arm" type="capsule" fromto="{_numbers(*ends)}" size="{radius}" '
             text += f'mass="{mass / len(capsules):.4g}"/>'
     text += f'<body name="hand" pos="0 0 {FLANGE}" euler="{_numbers(0, 0, -math.pi / 4)}" gravcomp="1">'
-    text += _geom("box", (0.0315, 0.102, 0.033), (0, 0, 0.033), mass=0.7, **{"class": "arm"})
+    text += '<geom class="arm" type="mesh" mesh="palm" mass="0.7"/>'
     for side, name in ((1, "left_finger"), (-1, "right_finger")):
         turn = 0 if side == 1 else math.pi
         text += f'<body name="{name}" pos="0 0 0.0584" euler="{_numbers(0, 0, turn)}" gravcomp="1">'
@@ -272,6 +279,7 @@ def _xml(things):
         rgba="{GREY["arm"]} 1"/><joint damping="1" armature="0.1"/></default>
       <default class="pad"><geom contype="1" conaffinity="0" friction="0.8 0.005 0.0001" group="2" condim="4"
         rgba="0.2 0.2 0.2 1"/></default></default>
+    <asset><mesh name="palm" vertex="{_numbers(*_palm())}"/></asset>
     <worldbody>
       <body name="floor">{_geom("plane", (3, 3, 0.1), **{**flat, "rgba": "0.55 0.55 0.55 1"})}</body>
       <body name="wall">{_geom("box", (0.05, 3, 2), (1.6, 0, 1), **{**flat, "rgba": "0.7 0.72 0.75 1"})}</body>
