@@ -153,7 +153,7 @@ def test_what_is_hidden_now_stands_where_it_stood(image):
     _, moved_on = fuse(image, now, ([BEHIND], [0.3]))
     np.testing.assert_allclose(moved_on.objects.size[2], BEHIND[0], atol=1e-6)
     # Where it would be seen, or stands something else that is seen, it is not.
-    for gone in (moved(BEHIND, y=-0.09), moved(BEHIND, x=-0.04)):
+    for gone in (moved(BEHIND, y=0.08), moved(BEHIND, x=-0.04)):
         assert np.flatnonzero(fuse(image, now, ([gone], [0.3]))[1].objects.valid).tolist() == [0, 1]
 
 

@@ -66,7 +66,7 @@ def pushed(**options):
         q7=Q7,
         opening=jnp.float32(0.0),
     )
-    return whole_trajectory(SETTING, options.pop("observation", seen()), action, config=CONFIG, **options)
+    return whole_trajectory(SETTING, options.pop("observation", seen(visible=False)), action, config=CONFIG, **options)
 
 
 def test_it_leads_from_home_through_the_action_and_home():
@@ -263,17 +263,17 @@ def test_on_its_way_the_hand_passes_at_half_of_that():
     hand = gripper_cloud(Gripper(), 0.08, float(Q7), 20000) @ T[:3, :3].T + T[:3, 3]
 
     def gap(beside, tall=0.09):
-        past = np.abs(hand - (PLACE[0], PLACE[1] - beside, Shelf().board + tall)) - (0.02, 0.02, tall)
+        past = np.abs(hand - (PLACE[0], PLACE[1] + beside, Shelf().board + tall)) - (0.02, 0.02, tall)
         return np.linalg.norm(np.maximum(past, 0.0), axis=1).min()
 
     free = np.array([beside for beside in np.arange(0.07, 0.2, 0.0005) if gap(beside) > 0.005]).min()
-    near = placed(free + 0.004, height=0.09, of=PLACE)
+    near = placed(-free - 0.004, height=0.09, of=PLACE)
     with pytest.raises(
         InputError, match=r"on its way the hand or what it holds would be \d+ mm from object 1, not 5 mm"
     ):
-        placed(free - 0.002, height=0.09, of=PLACE)
+        placed(0.002 - free, height=0.09, of=PLACE)
     with pytest.raises(InputError, match="not 12 mm or more; decide anew"):
-        placed(free + 0.004, sure=0.4, height=0.09, of=PLACE)
+        placed(-free - 0.004, sure=0.4, height=0.09, of=PLACE)
     # What comes near is said: the nearer, the surer one has to be.
     sure = dataclasses.replace(seen(), confidence=jnp.full(8, 0.99))
     assert touches(near, sure) == ()

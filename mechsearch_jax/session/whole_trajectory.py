@@ -325,9 +325,10 @@ class _Assembly:
             what = fixed.names[touches[0]]
             raise InputError(f"withdraw: on a straight way out the arm would touch {what}; take it out by hand")
         force, pace = (self.hand.force, self.motion.carry_pace) if holds else (0.0, 1.0)
-        out = self._timed(q, width, force)
-        back = self._free("the way home", out.position[-1], home, body, around, pace=pace)
-        stages = [_Stage(Part.WAY_HOME, out), self._travel(Part.WAY_HOME, back, width, force)]
+        # The arm rests where it has backed away, lest it cut the corner.
+        ways = [self._timed(way, width, force) for way in ([q[:2], q[1:]] if moves else [q])]
+        back = self._free("the way home", ways[-1].position[-1], home, body, around, pace=pace)
+        stages = [*(_Stage(Part.WAY_HOME, way) for way in ways), self._travel(Part.WAY_HOME, back, width, force)]
         return dataclasses.replace(self._joined(joints, width, stages, True), action=WITHDRAW)
 
     def back(self, joints: np.ndarray, home: np.ndarray, width: float, now: Superquadrics) -> RobotTrajectory:
