@@ -304,8 +304,9 @@ class _AllPairs:
 def _near(pairs: _Pairs) -> UInt8[Array, " k"]:
     """Which bounding boxes of clouds and objects overlap, along the axes of the clouds."""
     box, rotation = pairs.box(), pairs.relative[:, :, :3]
-    reach = jnp.sum(jnp.abs(rotation) * pairs.size[:, :, None], axis=1)
-    centre = -jnp.sum(rotation * pairs.relative[:, :, 3:], axis=1)
+    # Products of small matrices: a CPU takes five times as long for sums over an axis of three.
+    reach = matmul(pairs.size[:, None], jnp.abs(rotation))[:, 0]
+    centre = -matmul(pairs.relative[:, None, :, 3], rotation)[:, 0]
     return jnp.where(jnp.all((centre - reach < box[:, 1]) & (centre + reach > box[:, 0]), axis=1), OPEN, APART)
 
 

@@ -8,6 +8,7 @@ they are compacted, so that one full scene among a thousand empty ones costs no 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -25,8 +26,10 @@ GPU_BLOCKS = 64
 MANY, LARGER = 2**22, 4
 # Indices are 32 bits wide.
 LARGEST_INDEX = 2**31 - 1
-# Entries of a mask that are counted together, before the true ones among them are located.
-WIDTH = 64
+# Entries of a mask that are counted together, as the bits of a word, before the true ones among them are located.
+WIDTH = 32
+# Blocks whose entries a CPU locates at once.
+LOCATED = 16
 
 Carry = TypeVar("Carry")
 
@@ -111,34 +114,64 @@ def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carr
     if n <= block and not on_cpu():
         # A GPU evaluates the idle entries of a single block faster than it skips them.
         return body(carry, jnp.where(mask, jnp.arange(n, dtype=jnp.uint32), jnp.uint32(n)), mask)
-    size, rows = min(block, n), math.ceil(n / WIDTH)
-    bits = jax.lax.pad(mask.astype(jnp.uint8), jnp.uint8(0), ((0, rows * WIDTH - n, 0),)).reshape(rows, WIDTH)
-    ends = jax.lax.cumsum(jnp.sum(bits, axis=1, dtype=jnp.uint32))
-    starts = jax.lax.pad(ends, jnp.uint32(0), ((1, -1, 0),))
+    size, words = min(block, n), math.ceil(n / WIDTH)
+    bits = jax.lax.pad(mask, False, ((0, words * WIDTH - n, 0),)).reshape(words, WIDTH)
+    word = jnp.sum(bits.astype(jnp.uint32) << jnp.arange(WIDTH, dtype=jnp.uint32)[None], axis=1, dtype=jnp.uint32)
+    ends = jax.lax.cumsum(jax.lax.population_count(word))
     total = ends[-1]
-    # Steps of a bisection over the rows.
-    halvings = max(rows - 1, 1).bit_length()
+    # A CPU, to which each operation is a call, locates the entries of many blocks at once.
+    blocks = min(LOCATED, math.ceil(n / size)) if on_cpu() else 1
+    # Steps of a bisection over the words.
+    halvings = max(words - 1, 1).bit_length()
 
-    def step(i, carry):
-        rank = i * jnp.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
-        active = rank < total
-        rank = jax.lax.min(rank, total - 1)
+    def located(first):
+        """The next indices, from the `first`-th on."""
+        rank = jax.lax.min(first + jnp.arange(blocks * size, dtype=jnp.uint32), total - 1)
 
         def halve(_, bounds):
-            """The last row that begins at or before each rank."""
+            """The last word that begins at or before each rank."""
             low, high = bounds
             middle = jax.lax.shift_right_logical(low + high, jnp.uint32(1))
             later = taken(ends, middle) <= rank
             return jnp.where(later, middle + 1, low), jnp.where(later, high, middle)
 
-        first = jnp.zeros_like(rank)
-        row, _ = jax.lax.fori_loop(0, halvings, halve, (first, first + jnp.uint32(rows - 1)), unroll=not on_cpu())
-        before = jax.lax.cumsum(taken(bits, row), axis=1)
-        column = jax.lax.argmax(before > (rank - taken(starts, row)).astype(jnp.uint8)[:, None], 1, jnp.uint32)
-        return body(carry, jnp.where(active, row * jnp.uint32(WIDTH) + column, jnp.uint32(n)), active)
+        least = jnp.zeros_like(rank)
+        which, _ = jax.lax.fori_loop(0, halvings, halve, (least, least + jnp.uint32(words - 1)), unroll=not on_cpu())
+        found = taken(word, which)
+        before = taken(ends, which) - jax.lax.population_count(found)
+        return which * jnp.uint32(WIDTH) + _place(found, rank - before)
 
-    blocks = jax.lax.div(total + jnp.uint32(size - 1), jnp.uint32(size))
-    return jax.lax.fori_loop(jnp.uint32(0), blocks, step, carry)
+    def step(first, index, i, carry):
+        begin = i * jnp.uint32(size)
+        active = first + begin + jnp.arange(size, dtype=jnp.uint32) < total
+        index = jax.lax.dynamic_slice_in_dim(index, begin, size)
+        return body(carry, jnp.where(active, index, jnp.uint32(n)), active)
+
+    def steps(i, carry):
+        first = i * jnp.uint32(blocks * size)
+        index = located(first)
+        if blocks == 1:
+            return step(first, index, jnp.uint32(0), carry)
+        left = jax.lax.min(jnp.uint32(blocks), _ceil_div(total - first, size))
+        return jax.lax.fori_loop(jnp.uint32(0), left, functools.partial(step, first, index), carry)
+
+    return jax.lax.fori_loop(jnp.uint32(0), _ceil_div(total, blocks * size), steps, carry)
+
+
+def _ceil_div(a: Array, b: int) -> Array:
+    """Unsigned a / b, rounded up."""
+    return jax.lax.div(a + jnp.uint32(b - 1), jnp.uint32(b))
+
+
+def _place(word: Array, rank: Array) -> Array:
+    """The place of the bit of a word before which `rank` others are set."""
+    place = jnp.zeros_like(word)
+    for half in (16, 8, 4, 2, 1):
+        lower = jax.lax.population_count(word & jnp.uint32((1 << half) - 1))
+        above = rank >= lower
+        word = jnp.where(above, word >> jnp.uint32(half), word)
+        rank, place = jnp.where(above, rank - lower, rank), jnp.where(above, place + jnp.uint32(half), place)
+    return place
 
 
 def merged(run: Callable[[Array, Any, Any], Any], indices: float = 1.0) -> Callable[[Array, Any, Any], Any]:
