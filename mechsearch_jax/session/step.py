@@ -22,7 +22,7 @@ from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import TriedActions
 from mechsearch_jax.problem.problem import Problem
-from mechsearch_jax.robot.arm_clearance import FLOOR, TARGET
+from mechsearch_jax.robot.arm_clearance import FLOOR, SHELF, TARGET
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
@@ -69,6 +69,8 @@ UNMEASURED = (
 )
 # A motion that comes this near to something may touch it: the arm, what is recognised and the models are no better [m].
 BESIDE = 0.005
+# What comes this far into the shelf did not touch it in physics: its margins and the hand's model add up to that [m].
+INTO_SHELF = 0.002
 # An action has a gain if the cost is expected to fall by more than this share of it.
 GAIN = 1e-3
 # How often a grasp is tried at a place, and how near another one's place is the same [m].
@@ -257,7 +259,8 @@ def touches(trajectory: RobotTrajectory, observation: Observation) -> tuple[str,
     Objects and the target up to `BESIDE`, divided by how sure an object is, and anything that it reaches into.
     """
     sure = np.maximum(np.asarray(observation.judged().confidence, float), LEAST_SURE)
-    least = {f"object {i}": BESIDE / share for i, share in enumerate(sure)} | {TARGET: BESIDE, FLOOR: -np.inf}
+    least = {f"object {i}": BESIDE / share for i, share in enumerate(sure)} | {TARGET: BESIDE, SHELF: -INTO_SHELF}
+    least[FLOOR] = -np.inf
     found = [
         f"{near.body} ({abs(1000 * near.distance):.0f} mm {'beside it' if near.distance > 0.0 else 'into it'})"
         for near in trajectory.nearest
