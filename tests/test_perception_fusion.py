@@ -15,9 +15,9 @@ from mechsearch_jax.images.detection import BESIDE, TARGET_POINTS, fitted_pose, 
 from mechsearch_jax.images.labels import CAPACITY, FREE
 from mechsearch_jax.images.target_pose import SampledPixels
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception import fusion
 from mechsearch_jax.perception.confidence import Measures
 from mechsearch_jax.perception.explanation import Fitted
-from mechsearch_jax.perception.fusion import fused
 from mechsearch_jax.perception.recognition import LabelledImage
 from mechsearch_jax.workspace.camera import Camera, back_project, rays
 from mechsearch_jax.workspace.render import object_depth
@@ -79,7 +79,7 @@ def fuse(image, now, before, labels=None):
     else:
         earlier = Observation(objects(*before[0]), jnp.array(False), jnp.zeros(3), sure(*before[1]))
     settings = jnp.array(False), VIEW.camera, SHELF, TARGET
-    return fitted, fused(jax.random.key(0), fitted, earlier, image.replace(labels=labels), *settings)
+    return fitted, fusion.fused(jax.random.key(0), fitted, earlier, image.replace(labels=labels), *settings)
 
 
 def moved(box, x=0.0, y=0.0, yaw=0.0, longer=0.0):
@@ -155,6 +155,15 @@ def test_what_is_hidden_now_stands_where_it_stood(image):
     # Where it would be seen, or stands something else that is seen, it is not.
     for gone in (moved(BEHIND, y=0.08), moved(BEHIND, x=-0.04)):
         assert np.flatnonzero(fuse(image, now, ([gone], [0.3]))[1].objects.valid).tolist() == [0, 1]
+
+
+def test_what_is_kept_as_it_was_is_there_once(image, monkeypatch):
+    """Where no fit of it with its size kept is as good, such as one that sinks into the board."""
+    monkeypatch.setattr(fusion, "LEVEL", -1.0)
+    monkeypatch.setattr(fusion, "fused", fusion.fused.__wrapped__)
+    _, after = fuse(image, ([DEEP, OTHER_BOX], [0.8, 0.95]), ([OTHER_BOX, CARTON], [0.9, 0.99]))
+    assert np.flatnonzero(after.objects.valid).tolist() == [0, 1]
+    np.testing.assert_allclose(after.objects.position[0], objects(CARTON).position[0], atol=1e-6)
 
 
 def test_what_was_carried_away_is_not_remembered_where_it_stood(image):

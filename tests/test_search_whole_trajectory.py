@@ -293,6 +293,23 @@ def test_an_object_that_turns_between_the_fingers_does_not_meet_the_board():
         assert 0.0 < points[:, 2].min() - Shelf().board < 0.01
 
 
+def test_a_target_that_turned_between_the_fingers_does_not_meet_its_stand():
+    place, target = (0.35, -0.35, 0.2), SETTING.target
+    config = dataclasses.replace(CONFIG, place=place)
+    trajectory = whole_trajectory(
+        SETTING, seen(), retrieve_action(grasp(), Q7, jnp.float32(0.08)), width=0.0, config=config
+    )
+    assert trajectory.place_fault == ""
+    T, half = release(trajectory), np.array(target.half_size)
+    corners = half * np.stack(np.meshgrid(*3 * [[-1, 1]]), axis=-1).reshape(-1, 3)
+    stands = np.array(make(jnp.eye(3), jnp.float32([*PLACE, Shelf().board + half[2]])), float)
+    held = np.linalg.inv(np.array(grasp(), float)) @ stands
+    for turn in np.radians([-5, 5]):
+        about = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        points = (corners @ held[:3, :3].T + held[:3, 3]) @ about.T @ T[:3, :3].T + T[:3, 3]
+        assert 0.0 < points[:, 2].min() - place[2] < 0.012
+
+
 @functools.cache
 def pictured():
     """A scene, what a perfect recogniser sees of it, and its depth image."""

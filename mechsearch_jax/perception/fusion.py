@@ -148,7 +148,8 @@ def fused(
     met = jnp.sum(jnp.isfinite(entries(was, sample.origin, sample.directions)), axis=1) * sample.ray_weight
     through = price[slots : 2 * slots] - costs.object
     apart = jnp.where(selected[None], depth[slots : 2 * slots], -jnp.inf)
-    hidden = was.valid & (through <= SLACK + SLACK_SHARE * met) & (jnp.max(apart, axis=1) <= costs.overlap)
+    kept = selected[slots : 2 * slots]
+    hidden = was.valid & ~kept & (through <= SLACK + SLACK_SHARE * met) & (jnp.max(apart, axis=1) <= costs.overlap)
 
     def remember(turn, source):
         r, free = order[turn], source == ABSENT

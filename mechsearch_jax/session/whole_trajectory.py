@@ -407,7 +407,8 @@ class _Assembly:
         """
         what = grasped(self.problem, self.observation, self.action)
         T_world_gripper = np.asarray(self.action.T_world_gripper, float)
-        foot = self.problem.target.solid.bottom
+        # As an object is let go: so high that a corner which turned between the fingers does not meet its stand.
+        foot = self.problem.target.solid.bottom + self._sag()
         ways = place_ways(
             self.config.place,
             T_world_gripper,
