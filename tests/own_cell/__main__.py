@@ -1,6 +1,6 @@
 """Run searches in the cell, one JSON file each as they end, and print what came of them; a run that was killed goes on.
 
-python -m tests.own_cell --layouts 8 --seeds 5 --out DIR [--workers N] [--target box|cylinder] [--film]
+python -m tests.own_cell --layouts 8 --seeds 5 --out DIR [--first N] [--workers N] [--target box|cylinder]
 """
 
 import argparse
@@ -15,7 +15,8 @@ from . import search, summary
 
 def main():
     parser = argparse.ArgumentParser(prog="python -m tests.own_cell", description=__doc__.splitlines()[0])
-    parser.add_argument("--layouts", type=int, default=8, help="how many layouts, drawn by number from 0")
+    parser.add_argument("--first", type=int, default=0, help="number that the first layout is drawn by")
+    parser.add_argument("--layouts", type=int, default=8, help="how many layouts, one number after another")
     parser.add_argument("--seeds", type=int, default=5, help="searches of each, from 0")
     parser.add_argument("--out", type=Path, required=True, help="folder of rows, trajectory files and pictures")
     parser.add_argument("--workers", type=int, default=1, help="processes, of one thread each")
@@ -27,7 +28,7 @@ def main():
     given = parser.parse_args()
     rows, what = given.out / "rows", (given.target, given.arm)
     rows.mkdir(parents=True, exist_ok=True)
-    jobs = [(layout, seed) for seed in range(given.seeds) for layout in range(given.layouts)]
+    jobs = [(layout, seed) for seed in range(given.seeds) for layout in range(given.first, given.first + given.layouts)]
     jobs = [job for job in jobs if not search.row_file(given.out, *job, *what).exists() and not given.report]
     # What workers read as they import NumPy and JAX.
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
