@@ -31,7 +31,7 @@ from mechsearch_jax.grasping.retrieval import ALIKE, ALIKE_WRIST, best_grasp, to
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
-from mechsearch_jax.planner.step import SearchState, decide
+from mechsearch_jax.planner.step import DRAWS, SearchState, decide
 from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, scenes_of
 from mechsearch_jax.runtime.errors import InputError
 
@@ -298,6 +298,31 @@ def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
             np.testing.assert_array_equal, decision.action, jax.tree.map(lambda a: a[0, 0], decision.sequences.actions)
         )
         jax.tree.map(np.testing.assert_array_equal, decision.predicted, jax.tree.map(lambda a: a[0], after))
+
+
+def test_what_cannot_be_executed_gives_way_to_the_next_that_goes_well(problem):
+    over, away, aside = pushes()
+    belief, observation = look(problem, EDGE, found=False)
+    state, policy = SearchState(belief, observation, no_action()), proposes(aside, over, higher(aside), away)
+    trials = says(DONE, HARM, DONE, FAILED)
+
+    def chosen(least):
+        values = []
+
+        def executable(decision):
+            values.append(float(decision.value))
+            return values[-1] >= least
+
+        return decide(policy, trials, jax.random.key(0), problem, state, executable=executable), values
+
+    decided, values = chosen(-8.0)
+    np.testing.assert_array_equal(decided.decision.action.T_world_gripper, higher(aside).T_world_gripper)
+    # The one between does harm; what was refused counts as failed.
+    assert values == [-10.0, -8.0]
+    assert decided.tried.result.tolist() == [FAILED, HARM, DONE]
+    # Where none is left, all is drawn anew.
+    _, values = chosen(0.0)
+    assert values == [-10.0, -8.0, -10.0] * DRAWS
 
 
 def test_what_is_not_known_is_never_made(problem):

@@ -295,8 +295,8 @@ def test_the_target_is_put_down_where_it_is_to_stand():
     row = trajectory.put_down
     assert trajectory.part[row] == Part.PLACE
     assert trajectory.time[row] == pytest.approx(trajectory.events[-1].start)
-    # The target was grasped 5 cm above the board, in the middle of its 10 cm, and is let go as high above the place, and
-    # by so much higher as one of its corners can hang.
+    # The target was grasped 5 cm above the board, in the middle of its 10 cm, and is let go as high above the place and
+    # what a corner of it can hang.
     tip = tip_positions(trajectory.position[row][None])[0]
     np.testing.assert_allclose(tip[:2], BESIDE[:2], atol=4e-3)
     assert 0.0 < tip[2] - BESIDE[2] - 0.05 < 0.012

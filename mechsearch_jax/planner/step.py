@@ -21,7 +21,16 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.state import Decision
-from mechsearch_jax.planner.trials import Trials, TriedActions, TwoStagePolicy, choose, nothing_tried, scenes_of, tried
+from mechsearch_jax.planner.trials import (
+    TrialResult,
+    Trials,
+    TriedActions,
+    TwoStagePolicy,
+    choose,
+    nothing_tried,
+    scenes_of,
+    tried,
+)
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.pytree import PyTreeNode
 
@@ -91,9 +100,9 @@ def decide(
 ) -> Decided:
     """Decide for a single scene: the policy proposes, trials try, `choose` chooses. On the host.
 
-    Of a `TwoStagePolicy` actions are planned, and planned actions tried, only if the target is not taken out. What
-    cannot be executed is drawn anew, up to `DRAWS` times in all; a retrieval is not, for its grasp does not depend on
-    the key.
+    Of a `TwoStagePolicy` actions are planned, and planned actions tried, only if the target is not taken out. Where one
+    cannot be executed, the next that succeeds in its trial is chosen; where none is left, others are drawn, `DRAWS`
+    times in all. A retrieval is made in any case: its grasp does not depend on the key.
 
     Args:
       policy: see `policies.Policy`.
@@ -104,30 +113,62 @@ def decide(
       refusals: number of calls with this key that led to no action: others are drawn.
       executable: whether a decision can be executed, such as by the arm.
     """
+
+    def settled(decision: Decision) -> bool:
+        return executable(decision) or kind_of(int(decision.action.kind)).takes_target
+
     for draw in range(DRAWS * refusals, DRAWS * (refusals + 1)):
         draw_key = jax.random.fold_in(key, draw) if draw else key
-        decided = _decided(policy, trials, draw_key, problem, state, last)
-        if executable(decided.decision) or kind_of(int(decided.decision.action.kind)).takes_target:
+        decided, done = _decided(policy, trials, draw_key, problem, state, last, settled)
+        if done:
             break
     return decided
 
 
 def _decided(
-    policy: Any, trials: Trials | None, key: Array, problem: Problem, state: SearchState, last: bool
-) -> Decided:
-    if trials is None or not isinstance(policy, TwoStagePolicy):
-        questions = ["__call__"]
-    else:
-        questions = ["retrieval", "planned"] if state.belief.found else ["planned"]
+    policy: Any,
+    trials: Trials | None,
+    key: Array,
+    problem: Problem,
+    state: SearchState,
+    last: bool,
+    settled: Callable[[Decision], bool],
+) -> tuple[Decided, bool]:
+    """What one draw comes to, and whether that is settled."""
     everything = nothing_tried()
-    for question in questions:
-        decision = propose(policy, question, key, problem, state)
-        if trials is not None and decision.alternatives is not None:
-            scene = scenes_of(state.belief, state.observation), decision.alternatives
-            scenes, rows = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(scene))
-            results = trials(problem, scenes, rows.actions, rows.worth)
-            decision = choose(decision, jnp.asarray(results[0], jnp.int32), jnp.array(last))
-            everything = jax.tree.map(lambda *a: np.concatenate(a), everything, tried(rows, results))
-        if question == "retrieval" and kind_of(int(decision.action.kind)).takes_target:
-            break
-    return Decided(decision, everything)
+    if trials is not None and isinstance(policy, TwoStagePolicy) and state.belief.found:
+        decision = propose(policy, "retrieval", key, problem, state)
+        decision, everything, _ = _tried_out(decision, trials, problem, state, last, lambda _: True)
+        if kind_of(int(decision.action.kind)).takes_target:
+            return Decided(decision, everything), settled(decision)
+    question = "planned" if trials is not None and isinstance(policy, TwoStagePolicy) else "__call__"
+    decision = propose(policy, question, key, problem, state)
+    if trials is None:
+        return Decided(decision, everything), settled(decision)
+    decision, more, done = _tried_out(decision, trials, problem, state, last, settled)
+    return Decided(decision, jax.tree.map(lambda *a: np.concatenate(a), everything, more)), done
+
+
+def _tried_out(
+    proposed: Decision,
+    trials: Trials,
+    problem: Problem,
+    state: SearchState,
+    last: bool,
+    settled: Callable[[Decision], bool],
+) -> tuple[Decision, TriedActions, bool]:
+    """The first of the alternatives that succeeds in its trial and is settled, or else what `choose` makes of them."""
+    if proposed.alternatives is None:
+        return proposed, nothing_tried(), settled(proposed)
+    scene = scenes_of(state.belief, state.observation), proposed.alternatives
+    scenes, rows = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(scene))
+    wanted, results = rows.worth, np.zeros(rows.worth.shape, np.int32)
+    while True:
+        results = np.where(wanted, trials(problem, scenes, rows.actions, wanted), results)
+        decision = choose(proposed, jnp.asarray(results[0], jnp.int32), jnp.array(last))
+        won, done = np.flatnonzero(results[0] == TrialResult.SUCCEEDED), settled(decision)
+        if done or not len(won) or decision.value >= 0.0:
+            return decision, tried(rows, results), done
+        # As if it had failed in its trial; those after it were not tried yet.
+        results[0, won[0]] = TrialResult.FAILED
+        wanted = rows.worth & (np.arange(results.shape[1]) > won[0])[None]
