@@ -8,6 +8,7 @@ import pytest
 import mechsearch_jax as ms
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.runtime.compiled import CachedJit
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import OWN, in_own_settings, own_settings
 from mechsearch_jax.workspace.render import render_depth
 
@@ -73,3 +74,11 @@ def test_a_search_is_the_same_under_other_settings(problem, others):
         )
         same = ms.search_for_grasp()(jax.random.key(0), problem, belief, plain)
     np.testing.assert_array_equal(decision.action.T_world_gripper, same.action.T_world_gripper)
+
+
+def test_a_flag_with_which_xla_computes_wrong_numbers_is_refused(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false --xla_backend_optimization_level=0")
+    with pytest.raises(InputError, match=r"^XLA_FLAGS: --xla_backend_optimization_level=0 [^\n]*$"):
+        in_own_settings(lambda: None)()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=1")
+    in_own_settings(lambda: None)()

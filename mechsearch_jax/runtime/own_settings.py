@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import numpy as np
+
+from mechsearch_jax.runtime.errors import InputError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,10 +26,18 @@ OWN = {
     "jax_debug_infs": False,
     "jax_numpy_dtype_promotion": "standard",
 }
+# With it XLA makes derivatives wrong on a CPU, and so depth images: findings/xla-cpu-level-0-wrong-derivative.sh.
+UNOPTIMISED = "--xla_backend_optimization_level=0"
 
 
 def own_settings() -> contextlib.AbstractContextManager[object]:
-    """A block in which the settings of `OWN` hold in this thread."""
+    """A block in which the settings of `OWN` hold in this thread.
+
+    Raises:
+      InputError: `XLA_FLAGS` holds `UNOPTIMISED`.
+    """
+    if UNOPTIMISED in os.environ.get("XLA_FLAGS", "").split():
+        raise InputError(f"XLA_FLAGS: {UNOPTIMISED} makes derivatives wrong on a CPU; use 1, or leave it out")
     # Imported here so that `--help` does not wait for it.
     import jax
 
