@@ -264,7 +264,23 @@ def test_a_grasp_that_failed_twice_is_not_tried_a_third_time(problem):
         searcher.acted(ok=False)
     step = searcher.next(IMAGES.depth)
     assert step.kind == "none"
-    assert "2 grasps failed at this place" in step.reason
+    assert "it failed 2 times at this place" in step.reason
+
+
+def test_a_push_that_failed_twice_is_not_tried_a_third_time(problem):
+    made = []
+
+    def policy(*arguments):
+        made.append(costly(10.0, 5.0)(*arguments))
+        return made[-1]
+
+    searcher = searcher_of(problem, OPEN, policy=policy)
+    for _ in range(2):
+        assert "failed" not in searcher.next(IMAGES.depth).reason
+        # As if it had been handed out.
+        searcher._state = dataclasses.replace(searcher._now, handed=True, action=made[-1].action)
+        searcher.acted(ok=False)
+    assert "it failed 2 times at this place" in searcher.next(IMAGES.depth).reason
 
 
 def test_a_motion_that_was_not_reported_is_warned_of(problem):

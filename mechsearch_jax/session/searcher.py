@@ -593,9 +593,10 @@ class Searcher:
         if not (now.handed or (ok and now.acted and not now.executed and kind.takes_target)):
             raise InputError("acted: no motion was handed out since the last one; call next first")
         failures = now.failures
-        if (kind.takes_target or kind.holds_object) and not (now.way and (ok or now.way == WITHDRAW)):
+        if kind.code != ActionKind.NONE and not (now.way and (ok or now.way == WITHDRAW)):
             place = tuple(np.asarray(now.action.T_world_gripper, float)[:3, 3].tolist())
-            failures = () if ok else (*failures, place)
+            grasps = kind.takes_target or kind.holds_object
+            failures = (*failures, place) if not ok else () if grasps else failures
         self._state = dataclasses.replace(
             now,
             # The way out of the shelf, or back, is no action.

@@ -40,7 +40,7 @@ class State:
       finished: whether the target was taken out.
       refusals: number of steps without a motion since the last action.
       executed: whether that action was executed to its end.
-      failures: places of the gripper in grasps that failed since the last one that did not, [m].
+      failures: places of the gripper in actions that failed since the last grasp that did not, [m].
       way: name of the motion that was returned, where it only clears the hand after `action`; else empty.
       stopped: joint angles at which the last motion was broken off [rad]; empty if it was not, or that is not known.
       hypothesis_probabilities: what trials that learn hold of each hypothesis by its name, see

@@ -73,7 +73,7 @@ BESIDE = 0.005
 INTO_SHELF = 0.002
 # An action has a gain if the cost is expected to fall by more than this share of it.
 GAIN = 1e-3
-# How often a grasp is tried at a place, and how near another one's place is the same [m].
+# How often an action is tried at a place, and how near another one's place is the same [m].
 TRIES, SAME_PLACE = 2, 0.03
 
 
@@ -199,7 +199,7 @@ def motion_of(
       present: arm and hand.
       arm: home and speed.
       config: how trajectories are made.
-      failures: places of the gripper in grasps that failed [m].
+      failures: places of the gripper in actions that failed [m].
     """
     kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
     target = "the target is found" if belief.found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
@@ -218,8 +218,8 @@ def motion_of(
         why = f"no gain is expected of what could be done; {hindrance(problem, belief, observation.objects)}"
         return Motion(nothing, f"{target}; {why}", None, blocked=True, idle=True)
     place = np.asarray(decision.action.T_world_gripper)[:3, 3]
-    if (kind.takes_target or kind.holds_object) and times(failures, place) >= TRIES:
-        return refused(f"{TRIES} grasps failed at this place; see why, and mend that or move it by hand")
+    if times(failures, place) >= TRIES:
+        return refused(f"it failed {TRIES} times at this place; see why, and mend that or move it by hand")
     if sweeps_unmeasured(problem, belief, observation.objects, decision.action):
         return refused(UNMEASURED)
     try:
