@@ -160,8 +160,7 @@ def _collide(mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple)
         return collide(mask, points, boxes, dense, cloud, T_world_cloud, objects)
     m, n = mask.shape[-2:]
     pairs = _AllPairs(mask.shape, shared, *rows)
-    state = jnp.where(mask.reshape(-1), OPEN, APART)
-    state = pairs.decided(state, _near, BOXES)
+    state = pairs.decided(jnp.full(mask.size, APART), _near, BOXES, mask=mask.reshape(-1))
     if shared is not None and shared[2] is not None:
         state = pairs.decided(state, _bounded_by_coarse, CLOUDS)
         return (pairs.decided_by_groups(state) == HIT).reshape(mask.shape)
@@ -182,8 +181,7 @@ def _collide_bodies(parts: int, mask: Bool[Array, "*batch m n"], shared: tuple |
         return mask
     bodies = _AllPairs(mask.shape, shared, cloud, T_world_cloud, boxes, own)
     pairs = _AllPairs((*mask.shape[:-1], mask.shape[-1] * parts), shared, cloud, T_world_cloud, objects, own)
-    state = jnp.where(mask.reshape(-1), OPEN, APART)
-    state = bodies.decided(state, _near, BOXES)
+    state = bodies.decided(jnp.full(mask.size, APART), _near, BOXES, mask=mask.reshape(-1))
     tests = [(_bounded, CLOUDS), (_gauged, GAUGES)]
     if shared is not None and shared[2] is not None:
         tests = [(_bounded_by_coarse, CLOUDS), *tests]
@@ -245,9 +243,15 @@ class _AllPairs:
     own: tuple | None
 
     def decided(
-        self, state: UInt8[Array, " some"], test: Callable[[_Pairs], Array], block: int, which: Numbers | None = None
+        self,
+        state: UInt8[Array, " some"],
+        test: Callable[[_Pairs], Array],
+        block: int,
+        which: Numbers | None = None,
+        mask: Bool[Array, " some"] | None = None,
     ) -> UInt8[Array, " some"]:
-        """The states of the pairs after a test of the undecided ones; `which` has their numbers if they are not all."""
+        """The states of the pairs after a test of the undecided ones, or of those of a mask; `which` has their numbers
+        if they are not all."""
         last = jnp.uint32(len(state) - 1)
 
         def body(state, index, active):
@@ -255,7 +259,7 @@ class _AllPairs:
             chosen = number if which is None else jax.tree.map(lambda numbers: taken(numbers, number), which)
             return put(state, index, test(self.at(chosen)))
 
-        return for_each(state == OPEN, body, state, block_size(block, len(state)))
+        return for_each(state == OPEN if mask is None else mask, body, state, block_size(block, len(state)))
 
     def decided_by_groups(self, state: UInt8[Array, " some"]) -> UInt8[Array, " some"]:
         """The states of all pairs, from those groups of the undecided ones' points that are near the object."""

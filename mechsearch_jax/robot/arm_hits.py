@@ -3,11 +3,12 @@ as point clouds."""
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.bodies import any_part, world_parts
-from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.masked import masked_vmap, on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
 from mechsearch_jax.geometry.transforms import inverse, make, transform
 from mechsearch_jax.robot.gripper import arm_points
@@ -40,20 +41,18 @@ def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bo
       count: spheres for each capsule, see `arm_points`.
     """
     points, radius = arm_points(q, count)
-    if scene.parts is not None:
-        parts = world_parts(scene)
-        # Most parts are absent.
-        near = masked_vmap(_touches, parts.valid, None, (points, radius), parts, block=16)
-        return any_part(scene, near.T)
-    n = scene.capacity
-    radii = jnp.broadcast_to(radius[:, None], (radius.shape[0], n))
-    size, exponents = grown(
-        jnp.broadcast_to(scene.size[None], (*radii.shape, 3)),
-        jnp.broadcast_to(scene.exponents[None], (*radii.shape, 2)),
-        radii,
-    )
-    near = gauge(size[None], exponents[None], to_object_frame(scene, points)) < 1.0
-    return jnp.any(near, axis=1) & scene.valid[None]
+    arm, parts = (points, radius), world_parts(scene)
+    if scene.parts is None and not on_cpu():
+        return jax.vmap(_touches, (None, None, 0), out_axes=1)(None, arm, parts) & parts.valid[None]
+    # Most parts are absent, or far away.
+    reached = parts.valid & _in_boxes(points, radius, parts)
+    return any_part(scene, masked_vmap(_touches, reached, None, arm, parts, block=16).T)
+
+
+def _in_boxes(points: Float[Array, "w s 3"], radius: Float[Array, " s"], parts: Superquadrics) -> Bool[Array, " n"]:
+    """Which parts, grown by any of the spheres, contain its centre in their boxes; none touches another part."""
+    local = jnp.abs(to_object_frame(parts, points))
+    return jnp.any(jnp.all(local <= parts.size[None, None] + radius[None, :, None, None], axis=-1), axis=(0, 1))
 
 
 def _touches(_, arm: tuple[Float[Array, "w s 3"], Float[Array, " s"]], part: Superquadrics) -> Bool[Array, " w"]:

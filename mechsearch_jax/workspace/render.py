@@ -162,7 +162,9 @@ def merge_windows(camera: Camera, windows: Window) -> Float[Array, "height width
     n, h, w = windows.depth.shape
     row, among_rows = _window_pixels(windows.corner[:, 0], windows.stride, h, camera.height)
     column, among_columns = _window_pixels(windows.corner[:, 1], windows.stride, w, camera.width)
-    depth = windows.depth[jnp.arange(n)[:, None, None], row[:, :, None], column[:, None, :]]
-    return jnp.min(
-        jnp.where(among_rows[:, :, None] & among_columns[:, None, :], depth, jnp.inf), axis=0, initial=jnp.inf
-    )
+    image = jnp.full((camera.height, camera.width), jnp.inf)
+    # One after the other: their minimum along an axis would take a table of n images.
+    for i in range(n):
+        depth = windows.depth[i, row[i, :, None], column[i, None, :]]
+        image = jnp.minimum(image, jnp.where(among_rows[i, :, None] & among_columns[i, None], depth, jnp.inf))
+    return image
