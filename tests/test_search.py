@@ -44,6 +44,7 @@ from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session import faults
+from mechsearch_jax.session import searcher as searcher_module
 from mechsearch_jax.session.faults import check_image, recognition_warnings
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.session.searcher import Searcher
@@ -276,6 +277,21 @@ def test_where_the_arm_cannot_do_what_was_decided_on_others_are_drawn(problem):
     assert "does not reach" in step.reason
     searcher.next(IMAGES.depth)
     assert len(drawn) == 2 * DRAWS == len({str(key) for key in drawn})
+
+
+def test_after_each_look_at_which_nothing_could_be_done_less_distance_has_to_do(problem, monkeypatch):
+    kept = []
+
+    def refused(*arguments):
+        kept.append(next(a.beside for a in arguments if isinstance(a, TrajectoryConfig)))
+        return Motion("none", "refused", None, blocked=True)
+
+    monkeypatch.setattr(searcher_module, "motion_of", refused)
+    searcher = searcher_of(problem, HIDDEN, policy=grab)
+    for _ in range(5):
+        searcher.next(IMAGES.depth)
+    np.testing.assert_allclose(sorted(set(kept), reverse=True), [0.01, 0.005, 0.0, -0.003], atol=1e-9)
+    assert kept == sorted(kept, reverse=True)
 
 
 def test_what_a_policy_does_not_propose_cannot_be_tried(problem):

@@ -203,7 +203,7 @@ def test_an_action_out_of_reach_is_refused():
 HELD, STAND = np.array([0.02, 0.025, 0.06]), (0.58, -0.12)
 
 
-def placed(beside, sure=1.0, height=0.06, of=STAND):
+def placed(beside, sure=1.0, height=0.06, of=STAND, keep=0.01):
     """A pick-and-place of object 0, with object 1 so far to the right of its new place, or its old one [m], of which it
     is so sure."""
     scene = empty(8)
@@ -227,7 +227,7 @@ def placed(beside, sure=1.0, height=0.06, of=STAND):
         opening=jnp.float32(0.08),
     )
     observation = dataclasses.replace(seen(scene, visible=False), confidence=confidence)
-    return whole_trajectory(SETTING, observation, action, config=CONFIG)
+    return whole_trajectory(SETTING, observation, action, config=dataclasses.replace(CONFIG, beside=keep))
 
 
 def release(trajectory):
@@ -255,6 +255,26 @@ def test_an_object_is_put_down_clear_of_what_stands_beside():
     with pytest.raises(InputError, match="not 25 mm or more; decide anew"):
         placed(free + 0.005, sure=0.4)
     placed(free + 0.02, sure=0.4)
+
+
+def test_where_it_may_it_comes_so_far_into_what_it_does_not_move():
+    def least(keep):
+        """The least distance of object 1's middle at which it is made, and what is made there, by bisection [m]."""
+        low, high, made = 0.06, 0.15, None
+        while made is None or high - low > 2e-4:
+            middle = (low + high) / 2
+            try:
+                made, high = placed(middle, keep=keep), middle
+            except InputError:
+                low = middle
+        return high, made
+
+    (clear, _), (into, made) = least(0.0), least(-0.003)
+    assert 0.0015 < clear - into < 0.0045
+    distance = {each.body: each.distance for each in made.nearest}["object 1"]
+    assert -0.003 <= distance < 0.0
+    (warning,) = touches(made, seen())
+    assert f"may touch object 1 ({-1000 * distance:.0f} mm into it)" in warning
 
 
 def test_on_its_way_the_hand_passes_at_half_of_that():

@@ -68,7 +68,7 @@ from mechsearch_jax.session.step import (
     times,
     touches,
 )
-from mechsearch_jax.session.whole_trajectory import PUT_BACK, WITHDRAW, TrajectoryConfig, way_back, way_out
+from mechsearch_jax.session.whole_trajectory import CLEARER, PUT_BACK, WITHDRAW, TrajectoryConfig, way_back, way_out
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.sight import check_camera
 
@@ -527,8 +527,9 @@ class Searcher:
         """
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
         refused = self._now.refusals
-        # Where no place was found that is clear enough, less has to do.
-        config = dataclasses.replace(self._motions, beside=self._motions.beside / (1 + refused))
+        # Where nothing is clear enough, less has to do.
+        share = CLEARER[min(refused, len(CLEARER) - 1)]
+        config = dataclasses.replace(self._motions, beside=share * self._motions.beside)
 
         def executable(decision: Decision) -> bool:
             belief, observation = state.belief, state.observation

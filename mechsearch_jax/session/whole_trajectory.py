@@ -65,6 +65,10 @@ SAG = math.radians(5)
 LEAST_SURE = 0.3
 # Of the distance kept where something is put down, the share kept elsewhere in an action.
 PASSING = 0.5
+# Of that distance, the shares kept after 0, 1, 2, and 3 or more looks at which nothing could be done.
+CLEARER = (1.0, 0.5, 0.0, -0.3)
+# Farthest that the hand may come into what it does not move [m].
+DEEPEST = -0.01
 # An object that is predicted to move farther than this is pushed [m].
 MOVED = 1e-3
 # What stands beside what is picked up may come nearer to it by this as it is taken away [m].
@@ -90,8 +94,8 @@ class TrajectoryConfig:
       hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
       place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
       beside: how far hand and held object keep from other objects as they put one down, divided by how sure these are
-        [m], and half of it elsewhere in an action that moves an object; a `Searcher` takes less, a half, a third and so
-        on, after looks at which nothing could be done.
+        [m], and half of it elsewhere in an action that moves an object; below 0, how far they may come into them, and
+        into the shelf's margins. A `Searcher` takes less after looks at which nothing could be done (`CLEARER`).
       without_gain: whether a `Searcher` also hands out motions of which no lower cost is expected.
       obstacles: what else the arm keeps clear of; a `Searcher` adds its workcell's, the camera's body among them.
     """
@@ -108,7 +112,7 @@ class TrajectoryConfig:
 
     def __post_init__(self):
         check_place("TrajectoryConfig: place", self.place)
-        check_range("TrajectoryConfig: beside", self.beside, 0.0, FARTHEST, "m")
+        check_range("TrajectoryConfig: beside", self.beside, DEEPEST, FARTHEST, "m")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -603,17 +607,17 @@ class _Assembly:
             return
         acted, carried, keep = action.rows, int(self.action.object), self.config.beside
         others = np.arange(self.observation.objects.capacity) != carried
-        beside = {f"object {i}": keep / share for i, share in enumerate(self._sure()) if others[i]}
+        beside = {f"object {i}": max(keep, keep / share) for i, share in enumerate(self._sure()) if others[i]}
         if self._acted_on != TARGET:
             beside[TARGET] = keep
         x, holds, rows = tip_positions(acted.position)[:, 0], acted.force > 0.0, np.arange(len(acted.width))
         outside = rows[(x <= self.problem.gripper.nearest_outside + OUTSIDE) & holds]
         before = rows < outside[-1] if len(outside) else rows >= 0
         near = f"the hand{' or what it holds' if self.kind.holds_object else ''} would be"
-        # The shelf has margins of its own.
+        # The shelf has margins of its own, 9 mm and more.
         what = f"where it puts object {carried} down, {near}"
         for phase, part in ((1, rows[~before & holds]), (2, rows[~before & ~holds])):
-            self._keep_clear(action, phase, part, {**beside, SHELF: 0.0}, what)
+            self._keep_clear(action, phase, part, {**beside, SHELF: min(keep, 0.0)}, what)
         still = {name: PASSING * least for name, least in beside.items() if name not in self._moved()}
         for phase, part in ((0, rows[before & ~holds]), (1, rows[before & holds])):
             self._keep_clear(action, phase, part, still, f"on its way {near}", from_start=True)
