@@ -104,7 +104,8 @@ class TwoStagePolicy(Protocol):
 
 
 class TriedActions(NamedTuple):
-    """The actions that were tried out before one was made, in order, up to the first that succeeded; NumPy arrays.
+    """The actions that were tried out before one was made, in order, up to the first that succeeded; NumPy arrays. What
+    succeeded, but cannot be executed by the arm, counts as failed.
 
     Attributes:
       action: fields with a leading axis K.
