@@ -24,15 +24,15 @@ from mechsearch_jax.workspace.target import Target
 # a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found; those of
 # scenes with room for bodies of several parts; and, by a little, those for a target of pieces.
 BUDGET = {
-    ("cpu", "hidden"): (19_500, 77),
-    ("cpu", "found"): (23_100, 113),
+    ("cpu", "hidden"): (23_400, 119),
+    ("cpu", "found"): (28_900, 179),
     ("gpu", "hidden"): (20_400, 81),
     ("gpu", "found"): (23_700, 121),
-    ("cpu", "hidden", "parts"): (38_400, 111),
+    ("cpu", "hidden", "parts"): (43_400, 164),
     ("gpu", "found", "parts"): (41_800, 140),
-    ("cpu", "found", "pieces"): (23_200, 113),
+    ("cpu", "found", "pieces"): (29_000, 179),
     # Outside of batches a target that actions leave where it is has no candidate poses.
-    ("cpu", "found", "alone"): (18_900, 83),
+    ("cpu", "found", "alone"): (23_000, 135),
 }
 PIECES = Piece("cylinder", (0.03, 0.03, 0.05)), Piece("box", (0.02, 0.005, 0.03), (0.04, 0.0, 0.0))
 # Versions of JAX write the same program with a few equations and loops more or less.
