@@ -532,7 +532,7 @@ def measured_of_target(
 ) -> Float[Array, "x s"]:
     """The share of its measured pixels' area that was measured of the target at each place of the poses where `exists`.
 
-    Pixels that were mostly not measured are left out; 1 if no other is left.
+    Pixels that were hardly measured are left out; 1 if no other is left.
     """
 
     def share(depth, behind, inside):
@@ -574,8 +574,8 @@ def allowances(
 
     By default the detector's threshold; more if no place of a pose shows so few pixels, but a closer look at the
     present scene shows that the target is hidden; and more where only a part of its pixels would be measured, since the
-    detector counts measured ones. Where most of it would not be, what it shows right beside that does not count: next
-    to a hole of the target's own shape, the places nearest to it show a strip.
+    detector counts measured ones. Where two thirds of it would not be, what it shows right beside that does not count:
+    next to a hole of the target's own shape, the places nearest to it show a strip.
 
     Args:
       tables: constants of the problem.
@@ -597,7 +597,7 @@ def allowances(
         whole, apart = (
             shown_pixels(tables, coarse, image, everywhere) for image in (bodies, veiled(bodies, beside(measured)))
         )
-        strip = jnp.where(2 * shown <= whole, shown - apart, 0)
+        strip = jnp.where(3 * shown <= whole, shown - apart, 0)
         bound = jnp.floor(unseen / seen).astype(jnp.int32) + strip
     if not config.looks_closer:
         return bound

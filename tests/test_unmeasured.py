@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import mechsearch_jax as ms
 from mechsearch_jax import planner
@@ -134,6 +135,15 @@ def test_scattered_pixels_neither_open_the_shelf_nor_rule_the_truth_out(problem,
     assert bool(jnp.all(now.exists | ~before.exists))
     assert int(now.exists.sum()) < 1.2 * int(before.exists.sum())
     assert np.isfinite(now.unmeasured).mean() < 0.01
+
+
+def test_a_board_that_loses_most_of_its_pixels_in_patches_leaves_the_shelf_seen(problem, whole):
+    wavy = gaussian_filter(np.random.default_rng(0).standard_normal(IMAGES.depth.shape), 3.5)
+    of_shelf = ~np.isin(IMAGES.mask, np.arange(len(SCENE.objects)))
+    depth = np.where(of_shelf & (wavy < np.quantile(wavy, 0.6)), 0.0, IMAGES.depth)
+    before, now = look(problem, whole), look(problem, seen(problem, whole.objects, depth))
+    assert bool(jnp.all(now.exists | ~before.exists))
+    assert int(now.exists.sum()) < 1.5 * int(before.exists.sum())
 
 
 def test_what_was_seen_to_be_free_stays_free_until_something_is_done(problem, whole, holed):

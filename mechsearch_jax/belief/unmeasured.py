@@ -13,12 +13,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.actions.unseen_space import BORDER
-from mechsearch_jax.images.measured import MOSTLY
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.workspace.camera import project
 
 # The least thing that may stand somewhere: its half-width, and the height of a layer and how many layers it has [m].
 HALF_WIDTH, LAYER, LAYERS = 0.01, 0.02, 3
+# Share of its rays without depth from which on a place may be filled. A dark board loses 60%; less than all, since a
+# thing 2 cm wide covers few pixels whole.
+FILLED = 0.7
 # Height up to which things are expected [m].
 TALLEST = 0.3
 
@@ -57,8 +59,8 @@ def unmeasured_heights(
     in_front = depth < image[row, column]
     missing = in_front * (1.0 - jnp.where(in_image, measured[row, column], 0.0))
     of_layers = jnp.mean(missing, axis=-1)
-    filled = of_layers > MOSTLY
-    some = jnp.mean(of_layers[..., :LAYERS], axis=-1) > MOSTLY
+    filled = of_layers > FILLED
+    some = jnp.mean(of_layers[..., :LAYERS], axis=-1) > FILLED
     number = LAYERS + jnp.sum(jnp.cumprod(filled[..., LAYERS:], axis=-1), axis=-1)
     shelf = problem.shelf
     on_board = ((x > shelf.front) & (x < shelf.back))[:, None] & ((y > shelf.right) & (y < shelf.left))[None]

@@ -19,8 +19,9 @@ from mechsearch_jax.workspace.detector import longer
 
 # How much coarser than an image of 1280 x 720 shares are counted; with other images scaled like f's own image.
 DOWNSCALE = 7
-# Pixels of which less than this share was measured count as not measured.
-MOSTLY = 0.5
+# Pixels of which less than this share was measured count as not measured. A few rays tell that nothing stands there,
+# before a dark board that loses most of them, too; not fewer, since edges of things without depth cross pixels.
+LEAST = 0.2
 
 
 def share_step(camera: Camera) -> int:
@@ -72,7 +73,7 @@ def sampled(camera: Camera, share: Float[Array, "h w"], step: int) -> Float[Arra
 
 
 def veiled(image: Float[Array, "h w"], share: Float[Array, "h w"] | None) -> Float[Array, "h w"]:
-    """A depth image in which pixels that were mostly not measured hide whatever is there, as if by a thing at the lens.
+    """A depth image in which pixels that were hardly measured hide whatever is there, as if by a thing at the lens.
 
     Args:
       image: of the recognised bodies [m].
@@ -90,8 +91,8 @@ def beside(share: Float[Array, "h w"]) -> Float[Array, "h w"]:
 
 
 def unmeasured(share: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
-    """Which pixels were mostly not measured."""
-    return share < MOSTLY
+    """Which pixels were hardly measured."""
+    return share < LEAST
 
 
 def median_depth(frames: Sequence[Float[np.ndarray, "h w"]]) -> Float[np.ndarray, "h w"]:
