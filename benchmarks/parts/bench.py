@@ -205,8 +205,8 @@ def bench_plan(
     def propose(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
         return policy(key, problem, belief, seen)
 
-    def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
-        return step.decide(policy, trials, key, problem, SearchState(belief, seen, no_action())).decision
+    def decide(problem: Problem, key: Array, state: SearchState) -> Decision:
+        return step.decide(policy, trials, key, problem, state).decision
 
     if batch > 1:
         calls = [(problem, *_batch_of(states, batch))]
@@ -217,7 +217,8 @@ def bench_plan(
             compile_seconds, seconds = measure_first(_with_trials(jax.jit(propose_many), trials), calls, repeats)
     else:
         # As in a single episode: the policy compiles by itself, and computes only the branch that the belief selects.
-        compile_seconds, seconds = measure_first(decide, [(problem, *state) for state in states], repeats)
+        known = [(problem, key, SearchState(belief, seen, no_action())) for key, belief, seen in states]
+        compile_seconds, seconds = measure_first(decide, known, repeats)
     about = versions() | {"push model": method.config.push_model}
     return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), about)
 

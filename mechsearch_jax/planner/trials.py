@@ -118,7 +118,9 @@ class TriedActions(NamedTuple):
 
 def nothing_tried() -> TriedActions:
     """No actions."""
-    return TriedActions(jax.tree.map(lambda a: np.asarray(a)[None][:0], no_action()), np.zeros(0, np.int32))
+    # By shapes alone: arrays would be made on the device, and read back, for each decision.
+    blank = jax.tree.map(lambda a: np.zeros((0, *a.shape), a.dtype), jax.eval_shape(no_action))
+    return TriedActions(blank, np.zeros(0, np.int32))
 
 
 def tried(alternatives: Alternatives, results: Int[np.ndarray, "1 k"]) -> TriedActions:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax.numpy as jnp
+import numpy as np
 
 from mechsearch_jax.actions.kind import Kind, Sketch
 from mechsearch_jax.actions.types import Action, Prediction
@@ -14,14 +15,15 @@ CODE = 0
 
 def no_action() -> Action:
     """The action that does nothing."""
+    # Copies of the host's arrays: outside of `jit` each JAX operation is a program.
     return Action(
-        kind=jnp.int32(CODE),
-        object=jnp.int32(0),
-        T_world_gripper=jnp.eye(4),
-        displacement=jnp.zeros(3),
-        T_world_place=jnp.eye(4),
-        q7=jnp.float32(0.0),
-        opening=jnp.float32(0.0),
+        kind=jnp.asarray(np.int32(CODE)),
+        object=jnp.asarray(np.int32(0)),
+        T_world_gripper=jnp.asarray(np.eye(4, dtype=np.float32)),
+        displacement=jnp.asarray(np.zeros(3, np.float32)),
+        T_world_place=jnp.asarray(np.eye(4, dtype=np.float32)),
+        q7=jnp.asarray(np.float32(0.0)),
+        opening=jnp.asarray(np.float32(0.0)),
     )
 
 
