@@ -19,7 +19,7 @@ from mechsearch_jax.workspace.camera import project
 # The least thing that may stand somewhere: its half-width, and the height of a layer and how many layers it has [m].
 HALF_WIDTH, LAYER, LAYERS = 0.01, 0.02, 3
 # Share of its rays without depth from which on a place may be filled. A dark board loses 60%; less than all, since a
-# thing 2 cm wide covers few pixels whole.
+# thing 2 cm wide covers few pixels whole: half of those up to 4 cm wide are not noticed.
 FILLED = 0.7
 # Height up to which things are expected [m].
 TALLEST = 0.3
