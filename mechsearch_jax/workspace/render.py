@@ -21,28 +21,32 @@ GRAZING = 2e-3
 
 
 def _slab_chord(size, origin, direction):
-    """Where a ray enters and leaves the box around a superquadric; `enter > leave` if it misses."""
+    """Where rays enter and leave the box around a superquadric; `enter > leave` if they miss."""
     safe = jnp.where(jnp.abs(direction) < 1e-9, jnp.where(direction < 0, -1e-9, 1e-9), direction)
-    a, b = (-size - origin) / safe, (size - origin) / safe
-    return jnp.max(jnp.minimum(a, b)), jnp.min(jnp.maximum(a, b))
+    a, b = (jnp.broadcast_to(side - origin, safe.shape) / safe for side in (-size, size))
+    return jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
 
 
 def cast(
-    size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
-) -> Float[Array, ""]:
-    """First crossing of a ray with one superquadric, in its own frame.
+    size: Float[Array, "3"],
+    exponents: Float[Array, "2"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "*batch 3"],
+) -> Float[Array, "*batch"]:
+    """First crossings of rays with one superquadric, in its own frame.
 
     The gauge is convex along a ray, and at least 1 where the ray enters the bounding box: Newton's method from there
     approaches the first crossing from the near side, and a gauge that stops falling before it reaches 1 is a miss.
 
     Returns:
-      The ray parameter of the crossing, infinite for a miss; differentiable in all arguments where it is finite.
+      The ray parameters of the crossings, infinite for a miss; differentiable in all arguments where finite.
     """
     enter, leave = _slab_chord(size, origin, direction)
 
     def gauge(t):
         # Coordinate by coordinate: vectors would be kept in memory for every pixel and step.
-        return superquadric.unit_gauge([jnp.abs((origin[k] + t * direction[k]) / size[k]) for k in range(3)], exponents)
+        places = [jnp.abs((origin[k] + t * direction[..., k]) / size[k]) for k in range(3)]
+        return superquadric.unit_gauge(places, exponents)
 
     def value_and_slope(t):
         return jax.jvp(gauge, (t,), (jnp.ones_like(t),))
@@ -77,8 +81,7 @@ def object_depth(
     inverse = scene_object.rotation.T
     local_origin = rotate(inverse, origin - scene_object.position)
     local = rotate(inverse, directions)
-    trace = jax.vmap(cast, in_axes=(None, None, None, 0))
-    depth = trace(scene_object.size, scene_object.exponents, local_origin, local.reshape(-1, 3))
+    depth = cast(scene_object.size, scene_object.exponents, local_origin, local.reshape(-1, 3))
     return jnp.where(scene_object.valid, depth, jnp.inf).reshape(local.shape[:-1])
 
 
