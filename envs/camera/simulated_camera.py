@@ -281,10 +281,40 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
 @cached_jit(static_argnames=("window",))
 def pixels_in_window(camera: Camera, world: World, window: int) -> Int[Array, ""]:
     """`target_pixels` in a window of a given side in pixels, which is static."""
+    return _pixels_in_window(camera, world, window, 1)
+
+
+@cached_jit(static_argnames=("window", "stride"))
+def pixels_in_windows(
+    camera: Camera,
+    world: World,
+    places: Float[Array, "b 3"],
+    turns: Float[Array, "b 3 3"],
+    window: int,
+    stride: int,
+) -> Int[Array, " b"]:
+    """`pixels_in_window` with the target at each of several places, in every `stride`-th row and column alone.
+
+    Args:
+      camera, world: the scene.
+      places, turns: `t_world_target` [m] and `R_world_target`.
+      window, stride: in pixels; static.
+    """
+
+    def pixels(place: Array, turn: Array) -> Int[Array, ""]:
+        position, rotation = world.position.at[TARGET].set(place), world.rotation.at[TARGET].set(turn)
+        return _pixels_in_window(camera, world.replace(position=position, rotation=rotation), window, stride)
+
+    return jax.lax.map(lambda where: pixels(*where), (places, turns), batch_size=8)
+
+
+def _pixels_in_window(camera: Camera, world: World, window: int, stride: int) -> Int[Array, ""]:
+    """`target_pixels` in a window, in every `stride`-th of its rows and columns."""
     centre, _ = project(camera, world.position[TARGET])
     corner = jnp.floor(centre - (window - 1) / 2)
-    rows = corner[0] + jnp.arange(window)[:, None] + jnp.zeros((1, window))
-    columns = corner[1] + jnp.arange(window)[None, :] + jnp.zeros((window, 1))
+    steps = jnp.arange(0, window, stride)
+    rows = corner[0] + steps[:, None] + jnp.zeros((1, len(steps)))
+    columns = corner[1] + steps[None, :] + jnp.zeros((len(steps), 1))
     inside = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
     _, owner = _cast_bodies(camera, world, pixel_rays(camera, rows, columns))
     return jnp.sum(inside & (owner == TARGET))
