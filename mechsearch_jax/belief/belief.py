@@ -157,8 +157,10 @@ def without_grasps(belief: Belief) -> Belief:
 
     They would be masked out; without them, nothing is computed for them.
     """
-    grasps = belief.grasps
-    return belief.replace(grasps=grasps.replace(feasible=grasps.feasible[..., :0], q=grasps.q[..., :0, :, :]))
+    feasible, q = belief.grasps.feasible, belief.grasps.q
+    # Of NumPy, since outside of `jit` to cut arrays of JAX takes a program each.
+    none = np.zeros((*feasible.shape[:-1], 0), bool), np.zeros((*q.shape[:-3], 0, *q.shape[-2:]), q.dtype)
+    return belief.replace(grasps=belief.grasps.replace(feasible=none[0], q=none[1]))
 
 
 def without_candidates(problem: Problem, belief: Belief) -> tuple[Problem, Belief]:

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
@@ -200,7 +201,7 @@ class PlanningPolicy(PyTreeNode):
         decision = _plan(self._planning, key, *self._planned_with(problem, belief), observation)
         if not self.tries:
             return decision
-        reached = jnp.float32(self.objective.reached)
+        reached = np.float32(self.objective.reached)
         return decision.replace(alternatives=sequences_to_try(decision.sequences, observation.objects, reached))
 
 
