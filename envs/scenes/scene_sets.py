@@ -13,16 +13,19 @@ import hashlib
 import json
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.workspace.scenario import HASH_DIGITS, Scenario, load_scenario, save_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
 RECORD = Path(__file__).with_name("scene_sets.json")
+# A process for each so many scenes: it takes as long to start as a hundred of them.
+EACH = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,13 +253,29 @@ def scene_files(
     """
     place = Path(folder) if folder is not None else _kept_scenes()
     wanted = [(block, index, place / f"{block.scene_name(index)}.json") for block, index in scenes]
-    strange = []
-    for block, index, file in progress([entry for entry in wanted if not holds(entry[2], *entry[:2])]):
-        scene = make_scene(block, index)
+    strange, missing = [], [entry for entry in wanted if not holds(entry[2], *entry[:2])]
+    made = _made([entry[:2] for entry in missing])
+    for (block, index, file), scene in zip(progress(missing), made, strict=True):
         save_scenario(scene, file)
         if not is_recorded(block, index, scene):
             strange.append(scene.name)
     return SceneFiles([file for *_, file in wanted], strange)
+
+
+def _made(scenes: Sequence[tuple[Block, int]]) -> Iterator[Scenario]:
+    """The scenes, in order; many of them in several processes."""
+    processes = min(cores(), len(scenes) // EACH)
+    if processes < 2:
+        yield from (make_scene(*scene) for scene in scenes)
+        return
+    # Imported here because it takes long.
+    from mechsearch_jax.runtime.workers import workers
+
+    pool = workers(processes)
+    try:
+        yield from pool.map(make_scene, *zip(*scenes, strict=True), chunksize=4)
+    finally:
+        pool.shutdown(kill_workers=True)
 
 
 def set_scenes(scene_set: SceneSet) -> list[tuple[Block, int]]:

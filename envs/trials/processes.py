@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from pathlib import Path
-from typing import Any
 
 import jax
 import loky
@@ -21,12 +19,9 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.trials.native import NativeTrials, TrialSetup
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
-from mechsearch_jax.runtime.compiled import keep_in, kept_in
-from mechsearch_jax.runtime.cores import cores, share_of_cores
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.workers import workers
 from mechsearch_jax.session.preparing import Program
-
-# JAX's settings of its cache on disk.
-CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
 class ProcessTrials:
@@ -108,13 +103,7 @@ class ProcessTrials:
 
     def _workers(self) -> loky.ProcessPoolExecutor:
         if self._pool is None:
-            alone = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "OPENBLAS_NUM_THREADS": "1"}
-            self._pool = loky.ProcessPoolExecutor(
-                self.processes,
-                initializer=_keep,
-                initargs=(kept_in(), {name: getattr(jax.config, name) for name in CACHE}),
-                env=alone | share_of_cores(self.processes),
-            )
+            self._pool = workers(self.processes)
         return self._pool
 
     def _each(
@@ -151,14 +140,6 @@ class ProcessTrials:
 
 def _cell(problem: Problem) -> TrialSetup:
     return TrialSetup(problem.target, jax.device_get(problem.shelf), problem.gripper)
-
-
-def _keep(executables: Path | None, cache: Mapping[str, Any]) -> None:
-    """Keep compiled programs of a new process on disk, where this process keeps its own."""
-    if executables is not None:
-        keep_in(executables)
-    for name, value in cache.items():
-        jax.config.update(name, value)
 
 
 def _prepare(trials: NativeTrials, cell: TrialSetup) -> None:
