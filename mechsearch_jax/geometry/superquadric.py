@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mechsearch_jax.geometry.masked import on_cpu
 from mechsearch_jax.geometry.transforms import align, inverse, make, transform
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.own_settings import in_own_settings
@@ -131,15 +132,17 @@ def _norm2(a: Array, b: Array, p: Array) -> Array:
     """`(a**p + b**p) ** (1/p)` for `a, b >= 0`, without overflow and with finite gradients, also at the origin."""
     big, small = jnp.maximum(a, b), jnp.minimum(a, b)
     ratio = small / jnp.where(big > 0, big, 1.0)
-    # From the last to the first: XLA lets the result of an elementwise function take the place of an argument, and on a
-    # CPU it does not vectorise that (findings/xla-cpu-elementwise-in-place.sh).
     ratio, p = _backwards(ratio), _backwards(p)
     return big * _backwards(jnp.exp(jnp.log1p(_power(ratio, p)) / p))
 
 
 def _backwards(a: Array) -> Array:
-    """The array with the order of its last axis turned round."""
-    return jnp.flip(a, -1) if a.ndim else a
+    """On a CPU the array with the order of its last axis turned round, elsewhere the same.
+
+    XLA lets the result of an elementwise function take the place of an argument, and on a CPU it does not vectorise
+    that (findings/xla-cpu-elementwise-in-place.sh); what is turned round and back is no elementwise function.
+    """
+    return jnp.flip(a, -1) if a.ndim and on_cpu() else a
 
 
 def gauge(
