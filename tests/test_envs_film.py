@@ -12,6 +12,7 @@ from PIL import Image
 from recordings import MOVES, RECORDING, RESTS, SAMPLED, SEQUENCES, WORLD
 
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.recording import film as film_module
 from mechsearch_jax.envs.recording.film import Film
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.playback import ENDS, LOOKS, WAY_TIME, Playback, playback
@@ -220,6 +221,14 @@ def test_a_robot_that_stands_still_is_drawn_once_and_shown_as_often(played, monk
     shown = list(film)
     monkeypatch.setattr(Playback, "is_still", lambda self, row: False)
     assert all(np.array_equal(a, b) for a, b in zip(shown, film, strict=True))
+
+
+def test_several_processes_draw_the_same_pictures_in_order(monkeypatch):
+    alone = list(Film(RECORDING, 320, 3))
+    monkeypatch.setattr(film_module, "EACH", 1)
+    monkeypatch.setattr(film_module, "LOT", 2)
+    monkeypatch.setattr(film_module, "cores", lambda: 2)
+    assert all(np.array_equal(a, b) for a, b in zip(alone, Film(RECORDING, 320, 3), strict=True))
 
 
 def test_a_movie_is_what_its_ending_says(tmp_path):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import collections
+import functools
 import itertools
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -18,11 +20,12 @@ from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.workers import workers
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.film import Layout, Moving, Page
 from mechsearch_jax.viz.panda import panda_solids
-from mechsearch_jax.viz.raycast import Eye, VisibleSolid
+from mechsearch_jax.viz.raycast import Eye, Picture, VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -32,6 +35,9 @@ STANDS, LOOKS_AT = np.array([-0.56, 1.25, 0.85]), np.array([-0.09, -0.04, 0.03])
 LEFT_OUT = ("ceiling", "left")
 # Width of his view, in units of its distance.
 VIEW_ANGLE = 1.02
+# Pictures that a process draws at once; the most processes, which keep up with the rest of the film; and pictures that
+# take as long as a process takes to start.
+LOT, MOST, EACH = 8, 4, 100
 
 
 class Film:
@@ -59,35 +65,68 @@ class Film:
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         recording, played = self._recording, self._played
-        *_, width, height = self._layout.beside
-        eye = Eye(bystander(recording.shelf, width, height), LIGHT, AMBIENT, BACKGROUND_COLOUR)
-        empty = eye.picture(list(shelf_solids(recording.shelf).values()))
         poses = link_poses(played.q)
-        shown = [body_solids(step.world) for step in recording.steps]
+        # Of a robot that stands still the same picture is shown again.
+        moves = [row for row in range(self.count) if not played.is_still(row)]
+        pictures = self._beside(poses, moves)
+        picture = np.empty(0)
+        for index, rows in itertools.groupby(range(self.count), lambda row: int(played.step[row])):
+            step = recording.steps[index]
+            frame = recorded_frame(step, recording.camera, recording.shelf)
+            page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
+            points = body_points(step.world)
+            for row in rows:
+                picture = picture if played.is_still(row) else next(pictures)
+                yield page.image(picture, _moving(points, played, row, poses[row]))
 
-        def beside(row: int) -> UInt8[np.ndarray, "h w 3"]:
+    def _beside(
+        self, poses: Float[np.ndarray, "rows 8 4 4"], rows: Sequence[int]
+    ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """The bystander's view of rows, in order; of many in several processes, a little ahead of who takes them."""
+        played = self._played
+        shown = [body_solids(step.world) for step in self._recording.steps]
+        draw = functools.partial(_drawn, self._recording.shelf, *self._layout.beside[2:])
+
+        def solids(row: int) -> list[VisibleSolid]:
             bodies = [
                 moved(solid, played.rotation[row, i], played.position[row, i])
                 for i, own in shown[int(played.step[row])].items()
                 for solid in own
             ]
-            solids = [*bodies, *panda_solids(poses[row], float(played.opening[row]))]
-            return eye.picture(solids, empty).pixels
+            return [*bodies, *panda_solids(poses[row], float(played.opening[row]))]
 
-        picture = empty.pixels
-        with ThreadPoolExecutor(cores()) as pool:
-            for index, rows in itertools.groupby(range(self.count), lambda row: int(played.step[row])):
-                step = recording.steps[index]
-                frame = recorded_frame(step, recording.camera, recording.shelf)
-                page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
-                points = body_points(step.world)
-                # Small lots, so that pictures do not pile up where drawing is slower.
-                for lot in _in_lots(rows, 2 * cores()):
-                    # Of a robot that stands still the same picture is shown again.
-                    drawn = pool.map(beside, [row for row in lot if not played.is_still(row)])
-                    for row in lot:
-                        picture = picture if played.is_still(row) else next(drawn)
-                        yield page.image(picture, _moving(points, played, row, poses[row]))
+        lots = [rows[start : start + LOT] for start in range(0, len(rows), LOT)]
+        processes = min(cores(), MOST, len(rows) // EACH)
+        if processes < 2:
+            for lot in lots:
+                yield from draw([solids(row) for row in lot])
+            return
+        pool = workers(processes)
+        begun: collections.deque[Future[list[UInt8[np.ndarray, "h w 3"]]]] = collections.deque()
+        try:
+            for lot in lots:
+                begun.append(pool.submit(draw, [solids(row) for row in lot]))
+                if len(begun) > 2 * processes:
+                    yield from begun.popleft().result()
+            for lot in begun:
+                yield from lot.result()
+        finally:
+            pool.shutdown(kill_workers=True)
+
+
+def _drawn(
+    shelf: Shelf, width: int, height: int, pictures: Sequence[Sequence[VisibleSolid]]
+) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Pictures of solids before the shelf."""
+    eye, empty = _scenery(shelf, width, height)
+    return [eye.picture(solids, empty).pixels for solids in pictures]
+
+
+@functools.lru_cache(1)
+def _scenery(shelf: Shelf, width: int, height: int) -> tuple[Eye, Picture]:
+    """The bystander's eye, and what it sees of a shelf that is empty."""
+    eye = Eye(bystander(shelf, width, height), LIGHT, AMBIENT, BACKGROUND_COLOUR)
+    return eye, eye.picture(list(shelf_solids(shelf).values()))
 
 
 def bystander(shelf: Shelf, width: int, height: int) -> Camera:
@@ -103,11 +142,6 @@ def bystander(shelf: Shelf, width: int, height: int) -> Camera:
     rows = tuple((float(a), float(b), float(c)) for a, b, c in rotation)
     x, y, z = (float(p) for p in position)
     return Camera(width, height, focal, focal, width / 2, height / 2, rows, (x, y, z))
-
-
-def _in_lots(rows: Iterator[int], size: int) -> Iterator[list[int]]:
-    while lot := list(itertools.islice(rows, size)):
-        yield lot
 
 
 def shelf_solids(shelf: Shelf) -> dict[str, VisibleSolid]:
