@@ -18,7 +18,7 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 # Pages that lie elsewhere in the repository, and where they are on the site.
-ELSEWHERE = {"CHANGELOG.md": "changelog.md", "examples/ros2/README.md": "ros2.md"}
+ELSEWHERE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "examples/ros2/README.md": "ros2.md"}
 PLACES = {"README.md": "index.md", **ELSEWHERE}
 # Holds the package as it is installed, while the process lives.
 _TREE = tempfile.TemporaryDirectory()

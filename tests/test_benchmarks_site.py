@@ -29,37 +29,8 @@ FOLDER = ROOT / "docs/scene-sets"
 SHOWN = [name for name, about in ABOUT.items() if about.shown]
 
 
-def line(objects, rate, **settings):
-    """A line of a stored run: `rate` on all scenes, and 0.5 on those that nothing was chosen on."""
-    rates = {key: {"rate": rate, "interval": [rate - 0.1, rate + 0.1]} for key in set_pages.MEASURES}
-    unseen = {key: {"rate": 0.5, "interval": [0.4, 0.6]} for key in set_pages.MEASURES}
-    return {
-        "run": "some-run",
-        "preset": "standard",
-        "settings": settings,
-        "simulator": "MjxSimulator",
-        "scene_set": "c2",
-        "objects": objects,
-        "episodes": 20,
-        "scenes": 20,
-        "scenes_chosen_on": 10,
-        **rates,
-        "on_scenes_not_chosen_on": {"episodes": 10, **unseen},
-    }
-
-
-SHELF = {"workcell.shelf.back": 0.864, "workcell.shelf.left": 0.55, "workcell.shelf.right": -0.35} | {
-    "workcell.shelf.spawn_x": [0.45, 0.8],
-    "workcell.shelf.spawn_y": [-0.25, 0.45],
-}
 PAGES_OF_SETS = f"run `python -m {set_pages.__name__}`"
 NAMES = "benchmarks/lab/site/set_texts.py"
-
-
-def rates_on(name, *lines):
-    """The end of a page where lines of a set's runs are shown."""
-    of_set = [{**each, "scene_set": name} for each in lines]
-    return set_pages.page(name, of_set, ROOT / "benchmarks/results").split("## Rates", 1)[1]
 
 
 def test_every_set_is_on_a_page():
@@ -96,78 +67,13 @@ def test_pictures_are_of_sets_alone_that_may_be_looked_at():
     assert "report" not in SHOWN
 
 
-def test_rates_are_of_scenes_that_nothing_was_chosen_on():
-    tables = set_pages.rate_tables([line(2, 0.9), line(8, 0.8, policy="random")])
-    rows = [row for row in tables["Retrieved"].splitlines() if row.startswith("| `")]
-    cell = "0.50 (0.40 to 0.60)"
-    assert [row.split(" | ")[:4] for row in rows] == [
-        ["| `standard`", "10", cell, "–"],
-        ["| `standard`, `random`", "10", "–", cell],
-    ]
-
-
-def test_what_a_set_takes_from_its_shelf_is_no_variant():
-    text = rates_on("shelf-wide", line(2, 0.9, **SHELF), line(4, 0.9, **SHELF, recognition="masks"))
-    assert "| `standard` | 10 | 0.50" in text
-    assert "| `standard`, `masks` | 10 | – | 0.50" in text
-    assert "Nothing" not in text
-    assert "Other variants" not in text
-
-
-@pytest.mark.parametrize("changed", [{"workcell.shelf.back": 0.8}, {"mismatch.friction": 0.5}])
-def test_a_variant_without_a_row_is_linked(changed):
-    text = rates_on("shelf-wide", line(2, 0.9, **SHELF | changed))
-    assert "Other variants ran on it in [some-run]" in text
-    assert "Nothing" not in text
-    assert "| `standard` |" not in text
-
-
-def test_a_set_that_nothing_ran_on_says_so():
-    assert "Nothing that is stored ran on it yet." in rates_on("shelf-wide")
-
-
-def test_the_list_names_the_sets_that_nothing_ran_on_yet():
-    used = [{**line(2, 0.9), "scene_set": f"report-{letter}"} for letter in "abcefghi"]
-    assert "**To report a change**: of the sets [`report-*`](report.md) one that nothing ran on yet: `report-d`. " in (
-        set_pages.index_page(used)
-    )
-    used.append({**line(2, 0.9), "scene_set": "report-d"})
-    assert "**To report a change**: a new set, declared beside" in set_pages.index_page(used)
-
-
-def test_sets_on_one_page_have_rates_of_their_own():
-    lines = [{**line(2, 0.9), "scene_set": "report-b"}]
-    text = set_pages.page("report", lines, ROOT / "benchmarks/results")
-    first, second, *rest = text.split("## Rates on ")[1:]
-    nothing = [f"`report-{letter}`\n\nNothing that is stored ran on it yet." for letter in "acdefghi"]
-    assert [each.strip() for each in (first, *rest)] == nothing
-    assert "| `standard` | 10 | 0.50" in second
-    assert "mechsearch evaluate report-a --out rows" in text
-
-
-def test_simulators_are_told_apart():
-    lines = [line(2, 0.9), line(2, 0.9) | {"simulator": "NativeSimulator"}]
-    rows = [row for row in set_pages.rate_tables(lines)["Retrieved"].splitlines() if row.startswith("| `")]
-    assert [row.split(" | ")[0] for row in rows] == ["| `standard`", "| `standard`, in `NativeSimulator`"]
-
-
-def test_no_line_hides_another():
-    with pytest.raises(InputError, match=r"some-run\.jsonl: two lines with 2 objects read '`standard`'"):
-        set_pages.rate_tables([line(2, 0.9), line(2, 0.8)])
-
-
-def test_what_a_run_did_not_judge_has_no_table():
-    unjudged = line(2, 0.9) | {"retrieved": None}
-    unjudged["on_scenes_not_chosen_on"]["retrieved"] = None
-    assert set(set_pages.rate_tables([unjudged])) == {"Found", "Graspable"}
-
-
-def test_a_variant_says_what_differs():
-    settings = {"actions": ["push"], "recognition": "masks", "trials": "none"}
-    assert set_pages.label(line(2, 0.9, **settings)) == "`standard`, `masks`, push alone, without trials"
-    settings = {"actions": ["push", "pick-and-place"], "trials": "learning"}
-    words = "push and pick-and-place alone, with trials that learn the friction"
-    assert set_pages.label(line(2, 0.9, **settings)) == f"`standard`, {words}"
+def test_a_page_names_what_ran_on_its_sets():
+    lines = [{"run": "some-run", "scene_set": "report-b"}, {"run": "another", "scene_set": "c2"}]
+    text = set_pages.page("report", lines)
+    assert "Stored runs: [some-run](../../benchmarks/results/runs/some-run.jsonl)." in text
+    assert "another" not in text
+    assert "mechsearch evaluate report-i --out rows" in text
+    assert "What ran on it" not in set_pages.page("shelf-wide", lines)
 
 
 def test_the_baseline_of_the_guide_to_many_variants_is_one_of_them():
@@ -216,7 +122,7 @@ def test_steps_that_are_left_out_are_counted():
 
 
 def test_one_command_writes_every_page_that_the_docs_name():
-    text = (ROOT / "docs/commands.md").read_text()
+    text = (ROOT / "CONTRIBUTING.md").read_text()
     named = set(re.findall(r"`python -m (mechsearch_jax\.benchmarks\.[a-z_.]+(?:page|pages|seconds))\b", text))
     assert named - {all_pages.__name__} == {write.__module__ for write in all_pages.PAGES.values()}
 

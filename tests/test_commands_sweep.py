@@ -14,7 +14,7 @@ from stored_rows import row_of
 from mechsearch_jax.benchmarks.running import estimate as estimates
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
-from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, MeasuredSeconds, StoredSeconds, entries
+from mechsearch_jax.benchmarks.running.episode_seconds import Kind, MeasuredSeconds, StoredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
 from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, make_jobs, planned_jobs, present_code
 from mechsearch_jax.benchmarks.store.runs import StoredRun, stored_runs
@@ -324,19 +324,16 @@ def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
 def test_the_seconds_of_the_package_are_those_of_the_stored_runs():
     results = Path(__file__).parents[1] / "benchmarks/results"
     written = json.loads(SECONDS_FILE.read_text(encoding="utf-8"))
-    assert written == entries(results, stored_runs(results / "runs")), f"run `python -m {entries.__module__}`"
-    assert {H100} <= {entry["device"] for entry in written}
-    on_gpu = {entry["simulator"] for entry in written if entry["device"] == H100}
-    assert "MjxSimulator" in on_gpu
+    assert written == entries(stored_runs(results / "runs")), f"run `python -m {entries.__module__}`"
+    assert "MjxSimulator" in {entry["simulator"] for entry in written if entry["device"].startswith("gpu")}
 
 
 def test_of_several_runs_the_fastest_counts():
     """What ran beside the others made them slower."""
-    results = Path(__file__).parents[1] / "benchmarks/results"
     rows = [row_of(f"c2-4-{i:03d}", planning_seconds=3.0 + i, simulation_seconds=1.0) for i in range(2)]
     runs = [StoredRun(f"run{i}", (row,), ({"started": f"2026-01-0{i + 1}"},)) for i, row in enumerate(rows)]
     for each in (runs, runs[::-1]):
-        (entry,) = (entry for entry in entries(results, each) if entry["device"] == rows[0].device)
+        (entry,) = entries(each)
         assert (entry["episode_seconds"], entry["source"]) == (4.0, "benchmarks/results/runs/run0.parquet")
         assert Kind(*(entry[name] for name in Kind._fields)) == Kind.of(Method())
 

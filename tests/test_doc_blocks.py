@@ -22,6 +22,7 @@ from mechsearch_jax.workspace.scenario import COMPOUND_VERSION, FORMAT, parse_sc
 ROOT = Path(__file__).parents[1]
 PAGES = [
     ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
     ROOT / "examples/ros2/README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]

@@ -1,4 +1,4 @@
-"""Every mistake of the table in docs/commands.md is made here, and gets the message that the table states."""
+"""Every mistake of the table in mistakes.md is made here, and gets the message that the table states."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ from mechsearch_jax.session.faults import check_image
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
-GUIDE = Path(__file__).parents[1] / "docs/commands.md"
+GUIDE = Path(__file__).with_name("mistakes.md")
 HEADER = "| mistake | what is said |"
 IMAGES = example_images()
 CELL = Workcell(camera=IMAGES.camera)

@@ -19,8 +19,8 @@ def blocks(language):
     return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 
 
-def test_it_fits_a_few_screens():
-    assert len(README.splitlines()) <= 120
+def test_it_fits_two_screens():
+    assert len(README.splitlines()) <= 80
 
 
 def test_there_are_two_commands():
@@ -29,9 +29,8 @@ def test_there_are_two_commands():
     assert install_and_test.endswith("pytest")
 
 
-def test_the_first_screen_moves_and_the_filmstrip_is_there():
-    moving, still = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", README)
-    assert (ROOT / still).read_bytes().startswith(b"\x89PNG")
+def test_the_first_screen_moves():
+    (moving,) = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", README)
     assert README[: README.index(moving)].count("\n") < 10
     assert (ROOT / moving).stat().st_size < 5_000_000
     with Image.open(ROOT / moving) as picture:
@@ -64,6 +63,6 @@ def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys, monk
     assert np.isfinite(trajectory.position).all()
 
 
-@pytest.mark.parametrize("file", ["LICENSE", "CHANGELOG.md", ".ci/run", ".ci/release"])
+@pytest.mark.parametrize("file", ["LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff"])
 def test_files_that_it_names_are_there(file):
     assert (ROOT / file).stat().st_size > 0

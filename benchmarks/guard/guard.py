@@ -46,8 +46,8 @@ MEASURES: Mapping[str, Measure] = {
 ALPHA = 0.05
 # Actions of an episode without a retrieval: one more than any with it has, ten and the retrieval.
 NOT_RETRIEVED = 12
-# Share of episodes that end otherwise with another seed: published scenes, `standard`, retrieved
-# (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). A change of random numbers alone does the same.
+# Share of episodes that end otherwise with another seed: published scenes, `standard`, retrieved, 0.10 to 0.13. A
+# change of random numbers alone does the same.
 FLIPS = 0.12
 POWER = 0.8
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.lab import PROGRAM
-from mechsearch_jax.benchmarks.lab.commands import cells, episodes, looks, quality, targets
+from mechsearch_jax.benchmarks.lab.commands import episodes, looks, quality
 from mechsearch_jax.benchmarks.lab.commands.study import study
 from mechsearch_jax.commands.main import Commands, call_of, run
 
@@ -13,8 +13,6 @@ COMMANDS: Commands = {
     "study": study,
     **quality.COMMANDS,
     **looks.COMMANDS,
-    **cells.COMMANDS,
-    **targets.COMMANDS,
     **episodes.COMMANDS,
 }
 

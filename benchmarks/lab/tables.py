@@ -10,13 +10,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks.lab.calibration import offsets
 from mechsearch_jax.benchmarks.lab.ceiling import solvability
 from mechsearch_jax.benchmarks.lab.parts import push, scenes, segmentation
 from mechsearch_jax.benchmarks.lab.parts.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.lab.parts.recognition import SHARES, MeasuredRecognition
-from mechsearch_jax.benchmarks.lab.reach import reach
-from mechsearch_jax.benchmarks.lab.targets import graspable
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.intervals import with_interval
 
@@ -93,24 +90,6 @@ def _cells(line: Mapping[str, Any], intervals: bool) -> list[str]:
     return [str(line["objects"]), *means, *shares, f"{line['parts']:.2f}"]
 
 
-def targets_table(rows: Sequence[graspable.TargetRow]) -> Group:
-    """Whether meshes are grasped wherever physics says that they can be: a line for each, and one for all."""
-    table = plain_table("meshes alone on the board, at random poses")
-    for name in ("mesh", "poses", "physics", "both", "planner alone", "why not"):
-        table.add_column(name, justify="left" if name in ("mesh", "why not") else "right")
-    every = graspable.summary(rows)
-    for name, line in {**graspable.by_mesh(rows), "all": every}.items():
-        counts = (str(line[key]) for key in ("poses", "physics", "both", "planner_alone"))
-        table.add_row(name, *counts, ", ".join(f"{fault} ({count})" for fault, count in line["faults"].items()))
-    explanation = (
-        "physics: one of the random antipodal grasps takes the mesh out in a trial. both: so does one of the planner's,"
-        " which else does not for the reason on the right. planner alone: only one of the planner's does. Where physics"
-        f" does, the planner does in {with_interval(every['share'], every['interval'])} of poses; the interval accounts"
-        " for meshes, whose poses are alike."
-    )
-    return Group(table, Text(explanation, style="dim"))
-
-
 def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
     """What depth images are like: a row for each figure, a column for each sensor and view, or folder."""
     table = plain_table("depth images")
@@ -119,28 +98,6 @@ def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
         table.add_column(name, justify="right")
     for name in dict.fromkeys(name for column in columns.values() for name in column):
         table.add_row(escape(name), *(f"{column[name]:.2f}" if name in column else "-" for column in columns.values()))
-    return table
-
-
-def detection_table(figures: Mapping[str, Any]) -> Table:
-    """What is detected under every condition, as `detection.detection_figures` returns it, and in all."""
-    table = plain_table("detection of the target")
-    for name in (
-        "target",
-        "exposure",
-        "noise /255",
-        "red too strong",
-        "hue gap",
-        "missed",
-        "false",
-        "precision",
-        "recall",
-    ):
-        table.add_column(name, justify="left" if name == "target" else "right")
-    for line in figures["conditions"]:
-        light = (line["exposure"], line["noise"], line["white_balance"], line["hue_gap"])
-        table.add_row(line["target"], *(f"{number:g}" for number in light), *_detected(line))
-    table.add_row("all", *[""] * 4, *_detected(figures["all"]), style="bold")
     return table
 
 
@@ -260,24 +217,6 @@ def segmentation_tables(measured: segmentation.MeasuredSegments) -> Group:
     return Group(*tables.values(), Text(explanation, style="dim"))
 
 
-def calibration_table(measured: offsets.MeasuredOffsets) -> Group:
-    """How well the camera's offsets are found: a table for every sensor and use of the pixels."""
-    tables, lines = [], []
-    for part in measured.summary():
-        table = plain_table(f"{part['noise']}, {part['use']}")
-        for name in ("", "determined", "median error", "95th percentile", "largest", "stated standard error"):
-            table.add_column(name, justify="right", no_wrap=True)
-        for name, errors in part["errors"].items():
-            count, *figures = errors.values()
-            table.add_row(name, str(count), *("-" if figure is None else f"{figure:.3f}" for figure in figures))
-        tables.append(table)
-        lines.append(
-            f"{part['noise']}, {part['use']}: {part['with an offset']} with an offset, of {part['without an offset']} "
-            f"without one {part['false warnings']} are warned of; {1e3 * part['median_seconds']:.0f} ms."
-        )
-    return Group(*tables, Text("\n".join(lines), style="dim"))
-
-
 def push_scores_tables(measured: push.MeasuredPushes) -> Group:
     """How well pushes are predicted: a row for every model, and for the best by distance and by number of objects."""
     everything = {name: groups["all"] for name, groups in measured.scores.items()}
@@ -348,23 +287,6 @@ def scenes_table(rows: Sequence[scenes.SceneRow]) -> Group:
         if "exact_scenes" in line
     ]
     return Group(table, Text(explanation, style="dim"), *map(Text, beside_exact))
-
-
-def reach_table(rows: Sequence[reach.ReachRow]) -> Group:
-    """Where a target alone on the shelf can be grasped: a row for each band across it."""
-    table = plain_table("grasps of a target alone on the shelf, from its right wall to its left one")
-    for name in ("y [m]", "poses", "graspable", "hand", "reached", "feasible", "approaches"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for line in reach.bands(rows):
-        low, high = line["y"]
-        counts = (f"{line[name]:.1f}" for name in ("hand", "reached", "feasible", "approaches"))
-        table.add_row(f"{low:.3f} to {high:.3f}", str(line["poses"]), f"{line['graspable']:.2f}", *counts)
-    explanation = (
-        "graspable: share of the poses with a feasible grasp. The rest are means over poses. hand: grasps at which "
-        "gripper and target clear the shelf. reached: of these, those that the arm can follow. feasible: of these, "
-        "those at which its links clear the shelf. approaches: different directions among the feasible ones."
-    )
-    return Group(table, Text(explanation, style="dim"))
 
 
 def ceiling_table(rows: Sequence[solvability.CeilingRow]) -> Group:

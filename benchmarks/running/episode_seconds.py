@@ -15,18 +15,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechsearch_jax.benchmarks.statistics.preset_names import THREE_AHEAD, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.files import replacing
 
 FILE = Path(__file__).with_name("episode_seconds.json")
-# The run before rows were stored: on one H100 with 16 cores, in batches.
-EARLIER = "standard-h100.json"
-H100 = "gpu: NVIDIA H100 80GB HBM3"
 
 
 class Kind(NamedTuple):
@@ -167,29 +164,15 @@ def seconds_of(run: StoredRun) -> list[StoredSeconds]:
     ]
 
 
-def earlier(folder: PathLike) -> StoredSeconds:
-    """What the episodes of `EARLIER` took, by the clock: what it compiled first went on beside them."""
-    (run,) = (each for each in json.loads((Path(folder) / EARLIER).read_bytes())["runs"] if each["name"] == "c2")
-    clock = run["clock"]["nothing kept"]
-    episode = (clock["last episode [s]"] - clock["all compiled [s]"]) / len(run["episodes"])
-    compiling = clock["all compiled [s]"] - clock["first line [s]"]
-    return StoredSeconds(
-        H100,
-        Kind(THREE_AHEAD, "oracle", True, "MjxSimulator"),
-        MeasuredSeconds(episode, compiling, len(run["episodes"])),
-        f"benchmarks/results/{EARLIER}",
-    )
-
-
 def _with_compilation(entry: StoredSeconds, each: Sequence[StoredSeconds]) -> StoredSeconds:
     """An entry with the longest compilation of its device: of a batch, rows do not tell what is compiled beforehand."""
     longest = max(other.seconds.compile_seconds for other in each if other.device == entry.device)
     return dataclasses.replace(entry, seconds=entry.seconds._replace(compile_seconds=longest))
 
 
-def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]]:
-    """What `FILE` holds, of stored results and stored runs."""
-    each = [earlier(results), *(entry for run in runs for entry in seconds_of(run))]
+def entries(runs: Sequence[StoredRun]) -> list[dict[str, Any]]:
+    """What `FILE` holds, of stored runs."""
+    each = [entry for run in runs for entry in seconds_of(run)]
     slowest_first = sorted(each, key=lambda entry: -entry.seconds.episode_seconds)
     fastest = {(entry.device, entry.kind): _with_compilation(entry, each) for entry in slowest_first}
     return [
@@ -207,13 +190,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Write the file."""
     parser = argparse.ArgumentParser(description="Write how long episodes took, from the stored runs.")
     parser.add_argument("--results", default=str(RUNS.parent), help="folder of the stored results")
-    folder = Path(parser.parse_args(arguments).results)
+    folder = Path(parser.parse_args(arguments).results) / RUNS.name
+    if not folder.is_dir():
+        parser.error(f"{folder}: is not there; give the folder of the stored results as --results")
     try:
-        lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries(folder, stored_runs(folder / RUNS.name)))
+        lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries(stored_runs(folder)))
         with replacing(FILE) as file:
             file.write(f"[\n{lines}\n]\n".encode())
-    except FileNotFoundError as error:
-        parser.error(f"{error.filename}: is not there; give the folder of the stored results as --results")
     except InputError as error:
         parser.error(str(error))
 

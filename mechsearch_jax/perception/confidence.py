@@ -3,8 +3,8 @@
 Three things are measured for each object: how far the recognition network expects the centre to be from the true one,
 which share of its pixels does not lie on it or has rays that pass through it, and by how much it is better than what
 would stand for its pixels otherwise. A logistic function of their logarithms, fitted on simulated tables and shelves
-before four kinds of sensor, gives the probability that the object is right to 1 cm and 10 degrees (docs/experiments.md,
-"Networks of tables, shelves and sensors").
+before four kinds of sensor, gives the probability that the object is right to 1 cm and 10 degrees
+(docs/record/experiments.md, "Networks of tables, shelves and sensors").
 """
 
 from __future__ import annotations

@@ -342,38 +342,10 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     console.print(scenes_table(rows))
 
 
-def bench_detection(scenarios: Scenarios, /, *, places: int = 3, seed: int = 0, out: JsonFile = None) -> None:
-    """How well the target is detected by its colour, by light, noise and other things' hues: rates, and false ones.
-
-    Args:
-      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
-      places: random places of the target in each scenario, beside its own.
-      seed: of the places and of the noise.
-      out: JSON file for the figures.
-    """
-    from rich.console import Console
-
-    from mechsearch_jax.benchmarks.lab.detection.detection import conditions, detection_figures
-    from mechsearch_jax.benchmarks.lab.tables import detection_table
-    from mechsearch_jax.runtime.files import save_json
-
-    check_files(out)
-    given = [scenario for name in scenarios for scenario in _loaded([name])]
-    console, total = Console(highlight=False), len(conditions())
-    with console.status("compiling") as status:
-        figures = detection_figures(
-            given, places, seed, on_progress=lambda done: status.update(f"detecting {done}/{total}")
-        )
-    if out is not None:
-        save_json(figures, out)
-    console.print(detection_table(figures))
-
-
 COMMANDS = {
     "scenes": bench_scenes,
     "agreement": bench_agreement,
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,
-    "detection": bench_detection,
     "push": bench_push,
 }

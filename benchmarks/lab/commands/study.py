@@ -38,8 +38,7 @@ def study(
     and what several studies have in common is run once. Each study is then printed, as far as its rows are there.
 
     Args:
-      names: of studies: gamma, horizon, sequences, actions, extensions, push-model, steps, recognition,
-        friction-learned, images, baselines, friction, friction-without-trials, mass, friction-and-mass,
+      names: of studies: gamma, horizon, sequences, actions, baselines, friction, mass, friction-and-mass,
         calibration, sensor, cameras, shelf-low, shelf-narrow, shelf-wide, physics; or all.
       out: folder for the results, one row for each episode.
       scenes: only the first so many of each number of objects, for a quick look.

@@ -57,7 +57,7 @@ def _of_recognition(stored: Mapping[str, Any]) -> str:
     lines = []
     for source, scenes in SOURCES.items():
         for noise, label in NOISES.items():
-            for visible in ("all", "60% and more", "30 to 60%", "below 30%"):
+            for visible in ("all", "below 30%"):
                 cells = {
                     each["method"]: each
                     for each in stored["summary"]
@@ -76,7 +76,7 @@ def _of_segmentation(stored: Mapping[str, Any]) -> str:
     for source, scenes in SOURCES.items():
         for noise, label in NOISES.items():
             for each in stored["summary"]:
-                if (each["source"], each["noise"]) == (source, noise) and each["objects"] in (None, 2, 4, 6, 8):
+                if (each["source"], each["noise"]) == (source, noise) and each["objects"] in (None, 8):
                     count = "all" if each["objects"] is None else each["objects"]
                     missed = f"{each['missed']} of {each['counted']}"
                     lines.append([scenes, label, count, each["scenes"], f"{each['iou_mean']:.3f}", missed])
@@ -123,48 +123,6 @@ _VIEWS = (
     "a table."
 )
 
-# What the settings of training data are.
-MEANINGS = {
-    "objects": "least and largest number of objects in a scene",
-    "known": "share of objects that are one of the paper's eleven; the others are of any size",
-    "sides": "width and depth of boxes [m]",
-    "heights": "height of objects [m]",
-    "diameters": "of cylinders [m]",
-    "lying": "share of objects that lie on their side",
-    "leaning": "share of objects that lean",
-    "lean": "angle by which they do [rad]",
-    "touching": "share of objects that are pushed against another",
-    "target": "share of scenes with a target, whose points belong to no object",
-    "placements": "places that are tried for an object",
-    "noises": "each scene's sensor is one of these",
-    "stacked": "share of objects that stand on another",
-    "propped": "share of leaning objects that lean against another",
-    "tapered": "share of round objects whose radius shrinks towards an end",
-    "taper": "the smaller radius, as a share of the larger",
-    "hollow": "share of round objects that are open at the top",
-    "wall": "thickness of their walls [m]",
-    "tables": "share of table tops; the others are shelves",
-    "table": "depth, width and height of a table top's space [m]",
-    "shelf": "of a shelf's [m]",
-    "spread": "share of a table top's space over which things are spread",
-    "distance": "of the camera from the middle of the objects [m]",
-    "elevation": "angle by which it looks down on a table top [rad]",
-    "shelf_elevation": "angle by which it looks down into a shelf [rad]",
-    "azimuth": "largest angle by which it stands to a side of a table top [rad]",
-    "shelf_azimuth": "largest angle by which it stands to a side of a shelf [rad]",
-    "density": "pixels of an image for a metre at that distance",
-    "engine": "the simulator",
-    "pushes": "drawn for training",
-    "found": "that were simulated",
-    "held_out": "of these only used to score the network",
-    "worlds": "simulated at a time",
-    "rounds": "pushes in a world, one after the other",
-    "lengths": "of a push [m]",
-    "sideways": "share of pushes to the left or right; the others go forward or diagonally",
-    "tries": "pushes drawn at once, of which the first possible one is made",
-    "blur": "noise on an object's place in training [m]",
-}
-
 CARD_OF: dict[str, Card] = {
     "recognition": Card(
         title="The recognition network",
@@ -182,10 +140,7 @@ CARD_OF: dict[str, Card] = {
             "intersection over union of the recognised and the true "
             "volume, before and after refinement, and the rest after it."
         ),
-        also=(
-            "What becomes of it in whole searches: [results](../results.md#from-images), [the "
-            "log](../experiments.md#a-longer-training-of-the-recognition)."
-        ),
+        also="What becomes of it in whole searches: [results](../results.md#the-default).",
         limits=(
             _REAL,
             f"{_SHAPES} One superquadric an object: a mug or a chair comes out as one box or cylinder.",
@@ -213,7 +168,7 @@ CARD_OF: dict[str, Card] = {
         ),
         also=(
             "[The six worst images](../segmentation-failures.png), and what becomes of it in whole searches: "
-            "[results](../results.md#from-images), [the log](../experiments.md#a-longer-training-of-the-segmentation)."
+            "[results](../results.md#the-default)."
         ),
         limits=(
             _REAL,
@@ -270,30 +225,6 @@ def _told(stored: Mapping[str, Any]) -> str:
     return f"On one {stored['device']}, with jax {stored['jax']}:\n\n" + "\n".join(lines)
 
 
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        together = " to " if isinstance(value[0], int | float) else ", "
-        return together.join(map(_value, value))
-    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _data(data: Mapping[str, Any]) -> str:
-    """The table of the settings of training data: of a half of the scenes, and of the others."""
-    left_out = ("source", "seed", "places", "also", "share")
-    settings = {key: value for key, value in {**data, **data.get("places", {})}.items() if key not in left_out}
-    names = [key.replace("_", " ") for key in settings]
-    columns = {"setting": names, "value": map(_value, settings.values())}
-    if "also" in data:
-        usual = [data["also"].get(key) for key in settings]
-        # The sensors are the same, and round things have no other form.
-        unlike = [
-            key not in ("noises", "taper", "wall") and bool(value) for key, value in zip(settings, usual, strict=True)
-        ]
-        columns["default shelf"] = [_value(value) if shown else "" for value, shown in zip(usual, unlike, strict=True)]
-    columns["what it is"] = [MEANINGS[key] for key in settings]
-    return table(list(columns), zip(*columns.values(), strict=True))
-
-
 def page(name: str, results: PathLike = RESULTS, cards: PathLike = CARDS) -> str:
     """The card of a network.
 
@@ -317,7 +248,6 @@ def page(name: str, results: PathLike = RESULTS, cards: PathLike = CARDS) -> str
         stored=stored,
         size=f"{stored['bytes'] / 1e6:.1f} MB",
         shape=", ".join(f"{key} {value}" for key, value in stored["config"].items()),
-        data=_data(stored["data"]),
         lineage=_told(stored),
         commands=[each["command"] for each in _lineage(stored)],
         figures=CARD_OF[name].figures(measured),

@@ -7,7 +7,6 @@ The page is the template `reproduction_page.md.jinja` beside this file; every fi
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,10 @@ from mechsearch_jax.benchmarks.lab.site.results_page import table
 from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
 from mechsearch_jax.benchmarks.lab.site.store_run import rates_of
 from mechsearch_jax.benchmarks.lab.site.stored_tables import results_of_runs, runs_of
-from mechsearch_jax.benchmarks.lab.studies.comparison import COMPARED, OUTCOMES, WORDS
-from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, Figures
+from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES
 from mechsearch_jax.benchmarks.paper.reproduce import (
-    FACTORS,
     NOT_IN_THE_PAPER,
+    Mean,
     Results,
     Setting,
     actions_text,
@@ -31,20 +29,16 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
     origin_of,
 )
 from mechsearch_jax.benchmarks.statistics.intervals import with_interval
-from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes, steps_change
-from mechsearch_jax.benchmarks.statistics.rates import scene_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.scenes.scene_sets import CHOSEN_ON, is_chosen_on
 from mechsearch_jax.runtime.files import PathLike
 
 TEMPLATE = Path(__file__).with_name("reproduction_page.md.jinja")
-# Scenes by the share of their episodes in which they were solved: the largest share of each column.
-DIFFICULTY = {"none": 0.0, "to 1/4": 0.25, "to 1/2": 0.5, "to 3/4": 0.75, "below all": 1.0 - 1e-9, "all": 1.0}
 
 
 def _share(rate: Mapping[str, Any] | None) -> str:
-    return "-" if rate is None else with_interval(rate["rate"], rate["interval"])
+    return "-" if rate is None else with_interval(rate["rate"], rate["interval"], "{:.2f}")
 
 
 def _table(header: Sequence[str], lines: Sequence[Sequence[object]], constant: Sequence[str] = ()) -> str:
@@ -58,13 +52,8 @@ def _table(header: Sequence[str], lines: Sequence[Sequence[object]], constant: S
     return table([header[i] for i in kept], [[line[i] for i in kept] for line in lines])
 
 
-def _values(setting: Setting) -> list[str]:
-    """What a setting is, under the names of `FACTORS`."""
-    return [actions_text(setting) if name == "actions" else getattr(setting, name) for name in FACTORS]
-
-
 def _paper(value: float | None) -> str:
-    return NOT_IN_THE_PAPER if value is None else f"{value:g}"
+    return "-" if value is None else f"{value:g}"
 
 
 def runs_table(runs: Sequence[StoredRun], tables: Mapping[str, Results]) -> str:
@@ -136,84 +125,32 @@ def _grasp(setting: Setting, rows: Sequence[EpisodeRow], value: float | None) ->
 
 
 def cells_table(results: Results) -> str:
-    """Our shares beside the paper's."""
-    header = (*_CELL, "episodes", "found", "paper", "graspable", "paper")
-    more = ("paper_graspable", "retrieved", "drop_free")
-    lines = []
-    for setting, rows in results.rows.items():
-        for count in results.counts():
-            own = [row for row in rows if count in (None, row.objects)]
-            if not own:
-                continue
-            paper = results.paper(setting, count) or Figures(None, None, None, None)
-            rates, errors = rates_of(own), sum(row.is_error for row in own)
-            beside = (_share(rates["found"]), _paper(paper.find), _share(rates["graspable"]))
-            episodes = f"{len(own)}" + (f", {errors} errors" if errors else "")
-            grasp = _grasp(setting, rows, paper.grasp)
-            lines.append([*_cell(setting, count), episodes, *beside, grasp, *(_share(rates[name]) for name in more)])
-    return _table([*header, *(WORDS[name] for name in more)], lines, ["actions"])
-
-
-def actions_table(results: Results) -> str:
-    """Our mean numbers of actions beside the paper's."""
+    """Our shares and mean numbers of actions beside the paper's, where it has any."""
     lines = []
     for cell in results.cells():
-        paper = cell.paper or Figures(None, None, None, None)
-        find, grasp = (
-            with_interval(mean.value, mean.interval, "{:.2f}") for mean in (cell.find_steps, cell.grasp_steps)
-        )
-        place = _cell(cell.setting, cell.objects)
-        grasp_steps = _grasp(cell.setting, results.rows[cell.setting], paper.grasp_steps)
-        lines.append([*place, find, _paper(paper.find_steps), grasp, grasp_steps])
-    return _table([*_CELL, "actions to find", "paper", "to grasp", "paper"], lines, ["actions"])
-
-
-def differences_table(results: Results) -> str:
-    """Paired differences of everything from the first value of its factor, over all numbers of objects."""
-    lines = []
-    for factor, setting, base in results.pairs():
-        pairs = same_episodes(results.rows[setting], results.rows[base])
-        if not pairs:
+        if cell.paper is None:
             continue
-        changes = [(change_of(pairs, OUTCOMES[name]), "{:+.3f}") for name in COMPARED]
-        changes += [(steps_change(pairs, goal), "{:+.2f}") for goal in ("found", "graspable")]
-        texts = [with_interval(change.mean, change.interval, form) for change, form in changes]
-        lines.append([factor, _values(base)[FACTORS.index(factor)], *_values(setting), len(pairs), *texts])
-    header = ["factor", "base", *FACTORS, "pairs", *(WORDS[name] for name in COMPARED), "actions to find", "to grasp"]
-    return _table(header, lines, FACTORS)
+        setting, paper = cell.setting, cell.paper
+        own = [row for row in results.rows[setting] if row.objects == cell.objects]
+        rates = rates_of(own)
+        errors = sum(row.is_error for row in own)
+        lines.append(
+            [
+                *_cell(setting, cell.objects),
+                f"{len(own)}" + (f", {errors} errors" if errors else ""),
+                *(_share(rates["found"]), _paper(paper.find)),
+                *(_share(rates["graspable"]), _grasp(setting, own, paper.grasp)),
+                _share(rates["retrieved"]),
+                *(_steps(cell.find_steps), _paper(paper.find_steps)),
+                *(_steps(cell.grasp_steps), _grasp(setting, own, paper.grasp_steps)),
+            ]
+        )
+    header = (*_CELL, "episodes", "found", "paper", "graspable", "paper", "retrieved")
+    return _table([*header, "actions to find", "paper", "to grasp", "paper"], lines, ["actions", "episodes"])
 
 
-def unchosen_table(results: Results) -> str:
-    """The rates on those scenes alone that nothing was chosen on; empty where that is all or none of them."""
-    lines = []
-    for setting, rows in results.rows.items():
-        new = [row for row in rows if not is_chosen_on(row.scenario)]
-        if new and len(new) < len(rows):
-            rates = rates_of(new)
-            lines.append([*_values(setting), len(new), *(_share(rates[name]) for name in COMPARED)])
-    return _table([*FACTORS, "episodes", *(WORDS[name] for name in COMPARED)], lines, FACTORS) if lines else ""
-
-
-def difficulty_table(tables: Mapping[str, Results]) -> str:
-    """How many scenes are how hard: in which share of their episodes they were solved."""
-    groups: dict[tuple[str, str, int], dict[Any, list[bool]]] = {}
-    for name, results in tables.items():
-        for setting, rows in results.rows.items():
-            for row in rows:
-                scenes = groups.setdefault((name, setting.part, row.objects), {})
-                scenes.setdefault(scene_of(row), []).append(row.retrieved)
-    lines = []
-    for (name, part, objects), scenes in groups.items():
-        counts = collections.Counter(_column(sum(ends) / len(ends)) for ends in scenes.values())
-        episodes = sorted({len(ends) for ends in scenes.values()})
-        each = f"{episodes[0]}" if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
-        place = (name.replace("table", "Table "), part, objects, len(scenes), each)
-        lines.append([*place, *(counts[column] for column in DIFFICULTY)])
-    return table(["table", "of", "objects", "scenes", "episodes of each", *DIFFICULTY], lines)
-
-
-def _column(share: float) -> str:
-    return next(column for column, largest in DIFFICULTY.items() if share <= largest)
+def _steps(mean: Mean) -> str:
+    return "-" if mean.value is None else f"{mean.value:.2f}"
 
 
 def findings(tables: Mapping[str, Results]) -> list[dict[str, Any]]:
@@ -255,13 +192,7 @@ def page(folder: PathLike) -> str:
     environment = jinja2.Environment(
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
-    environment.globals |= {
-        function.__name__: function
-        for function in (
-            *(parts_of, source, cells_table, actions_table),
-            *(differences_table, unchosen_table, difficulty_table, scenes_table),
-        )
-    }
+    environment.globals |= {function.__name__: function for function in (parts_of, source, cells_table, scenes_table)}
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     return template.render(
         stored=runs,

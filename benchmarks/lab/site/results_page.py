@@ -1,8 +1,7 @@
-"""Writes docs/results.md, what holds today: `python -m mechsearch_jax.benchmarks.lab.site.results_page` in a checkout.
+"""Writes docs/results.md: `python -m mechsearch_jax.benchmarks.lab.site.results_page` in a checkout.
 
 The page is the template `results_page.md` beside this file. A field of the template is a value of a stored result,
-`{simulate-h200[steps_per_second]}` of `benchmarks/results/simulate-h200.json`, or one that is computed here. What was
-measured on the way to today's default is in docs/experiments.md, which is written by hand.
+`{simulate-h200[steps_per_second]}` of `benchmarks/results/simulate-h200.json`, or one that is computed here.
 """
 
 from __future__ import annotations
@@ -15,26 +14,23 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
 from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
-from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.preset_names import WITHIN_45, Settings, settings_of
+from mechsearch_jax.benchmarks.statistics.preset_names import Settings, settings_of
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
-from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
 from mechsearch_jax.runtime.files import PathLike
 
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
-# Of today's default, and of the former ones. Fields of the page are named after them.
-RUNS = ("report-i-h200", "table1-narrow-sides-h200", "report-h-whole-h200")
-# The default before, in the run of today's first one.
-BEFORE = "report-i-before-h200"
-# Of the default before, on scenes that it was chosen on.
-PUBLISHED = "published-narrow-sides-h200"
-# Whose decisions are timed in a batch.
-BATCH = "one-ahead-c2-h200"
+# Runs of the default: true shapes and images, other worlds, and household things. Fields of the page have their names.
+RUNS = ("report-i-h200", "report-i-worlds-h200", "report-household-bases-h200")
+# What of a simulated world differs from what the planner assumes, by its name on the page.
+WORLDS: Mapping[str, Mapping[str, float]] = {
+    "friction and mass of each body half to twice": {"mismatch.friction_spread": 2.0, "mismatch.mass_spread": 2.0},
+    "shapes up to 5% off": {"mismatch.size_spread": 1.05},
+}
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -51,11 +47,6 @@ class Stored(dict[str, Any]):
     def __missing__(self, name: str) -> Any:
         self[name] = json.loads((self.folder / f"{name}.json").read_bytes(), object_hook=_with_milliseconds)
         return self[name]
-
-    def run(self, name: str, run: str) -> dict[str, Any]:
-        """One run of a file, by its name or policy, whose episodes are by the names of their columns."""
-        (chosen,) = (each for each in self[name]["runs"] if each.get("name", each.get("policy")) == run)
-        return chosen | {"episodes": [dict(zip(self[name]["columns"], row, strict=True)) for row in chosen["episodes"]]}
 
 
 def _with_milliseconds(value: dict[str, Any]) -> dict[str, Any]:
@@ -95,11 +86,10 @@ def with_interval(episodes: Sequence[Episode], key: str) -> str:
 
 def rate_cells(episodes: Sequence[Episode]) -> list[str]:
     """The cells under `RATES` without the number of objects."""
-    has_graspable = all("graspable_step" in episode for episode in episodes)
     return [
         str(len(episodes)),
         with_interval(episodes, "found_step"),
-        with_interval(episodes, "graspable_step") if has_graspable else "–",
+        with_interval(episodes, "graspable_step"),
         share(reached(episodes, "paper_graspable_step")),
         with_interval(episodes, "retrieved"),
         f"{sum(episode['steps'] for episode in episodes) / len(episodes):.1f}",
@@ -109,9 +99,10 @@ def rate_cells(episodes: Sequence[Episode]) -> list[str]:
 def rates(column: str, groups: Mapping[str, Sequence[Episode]]) -> str:
     """A table of rates by number of objects of groups of episodes, which `column` is the header of."""
     lines = [
-        [label, count, *rate_cells(with_objects(episodes, count))]
+        [label, count, *rate_cells(of_count)]
         for label, episodes in groups.items()
         for count in COUNTS
+        if (of_count := with_objects(episodes, count))
     ]
     return table([column, *RATES], lines)
 
@@ -126,19 +117,6 @@ def mishaps(groups: Mapping[str, Sequence[Episode]]) -> str:
         lines.append([label, len(episodes), *shares, reasons])
     header = ["scenes", "episodes", "an object left the board", "the arm was held up", "f ruled out the true pose"]
     return table([*header, "lost: episodes by reason"], lines)
-
-
-def paper_rates(episodes: Sequence[Episode]) -> str:
-    """The table of preset `paper` beside the paper's figures."""
-    lines = []
-    for count in COUNTS:
-        chosen = with_objects(episodes, count)
-        figures = paper_figures(TABLES["table1"], "oracle", METHODS[1], BOTH, count)
-        assert figures is not None
-        ours = [share(reached(chosen, key)) for key in ("found_step", "graspable_step", "retrieved")]
-        lines.append([count, len(chosen), *ours, f"{figures.find:.2f}", f"{figures.grasp:.2f}"])
-    header = ["objects", "episodes", "found", "graspable", "retrieved", "the paper: found", "the paper: graspable"]
-    return table(header, lines)
 
 
 def pushes(stored: Stored) -> str:
@@ -200,17 +178,14 @@ def real_kinds(stored: Stored) -> str:
     return ", ".join(f"{kind} {value:.2f}" for kind, value in kinds.items())
 
 
-def _on_new_scenes(run: StoredRun, preset: str = "standard", **differing: Any) -> list[EpisodeRow]:
-    """The rows with such settings on scenes that nothing was chosen on; a later option was as it is usually."""
-    wanted = Settings(preset, differing)
-    rows = [row for row in run.rows if not is_chosen_on(row.scenario)]
-    return [row for row in rows if settings_of(options_of(row)) == wanted]
+def _with_settings(run: StoredRun, **differing: Any) -> list[EpisodeRow]:
+    """The rows of the default with such settings."""
+    wanted = Settings("standard", differing)
+    return [row for row in run.rows if settings_of(options_of(row)) == wanted]
 
 
-def _named(label: str, rows: Sequence[EpisodeRow]) -> dict[str, list[Episode]]:
-    """Rows as episodes, by a label that says with how many seeds where there are several."""
-    seeds = len({row.seed for row in rows})
-    return {f"{label}, {seeds} seeds" if seeds > 1 else label: [vars(row) for row in rows]}
+def _episodes(rows: Sequence[EpisodeRow]) -> list[Episode]:
+    return [vars(row) for row in rows]
 
 
 def _change(after: Sequence[EpisodeRow], before: Sequence[EpisodeRow]) -> dict[str, Any]:
@@ -229,58 +204,51 @@ def _change(after: Sequence[EpisodeRow], before: Sequence[EpisodeRow]) -> dict[s
     }
 
 
-def default_rates(today: StoredRun, table1: StoredRun, before: StoredRun, *, beside: StoredRun) -> dict[str, Any]:
-    """The fields of the template about what the default and the one before reach, with true shapes and from images;
-    `beside` is of the one before, in the run of today's."""
-    masks, full = {"recognition": "masks"}, {"recognition": "full"}
-    new, new_full = _on_new_scenes(today), _on_new_scenes(today, **full)
-    old, old_full = _on_new_scenes(before, WITHIN_45), _on_new_scenes(before, WITHIN_45, **full)
-    default = _named("`report-i`", new)
-    seen = _named("`full`, `report-i`", new_full)
+def default_rates(today: StoredRun, worlds: StoredRun, household: StoredRun) -> dict[str, Any]:
+    """The fields of the template about what the default reaches."""
+    true, full = _with_settings(today), _with_settings(today, recognition="full")
+    other = {name: _with_settings(worlds, **differing) for name, differing in WORLDS.items()}
+    things = {
+        "true shapes": _with_settings(household),
+        "`full-parts`": _with_settings(household, recognition="full-parts"),
+    }
+    changes = {name: _change(rows, true) for name, rows in other.items()}
     return {
-        "default_rates": rates("scenes", default),
-        "default_mishaps": mishaps({**default, **seen}),
-        "image_rates": rates(
-            "recognition",
+        "default_rates": rates("seen", {"true shapes": _episodes(true), "`full`": _episodes(full)}),
+        "mishaps": mishaps(
             {
-                **_named("before: `masks`, `c2`", _on_new_scenes(table1, WITHIN_45, **masks)),
-                **seen,
-            },
+                "`report-i`, true shapes": _episodes(true),
+                "`report-i`, `full`": _episodes(full),
+                **{f"`report-i`, {name}": _episodes(rows) for name, rows in other.items()},
+                **{f"`report-household`, {name}": _episodes(rows) for name, rows in things.items()},
+            }
         ),
-        "farther_sides": _change(new, beside.rows)["all"],
-        "loss": _change(new_full, new),
-        "loss_before": _change(old_full, old),
+        "household_rates": rates("seen", {name: _episodes(rows) for name, rows in things.items()}),
+        "loss": _change(full, true),
+        "worlds": table(
+            ["world", "pairs", "change of retrieved, points", "with 2, 4, 6, 8 objects"],
+            [[name, change["pairs"], change["all"], change["each"]] for name, change in changes.items()],
+        ),
+        "batch_decision": 1000 * sum(row.planning_seconds for row in true) / sum(row.steps for row in true),
     }
 
 
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template that are no values of a file."""
-    new = stored.run("standard-h100", "c2")
-    paper = stored.run("published-paper-h200", "search-for-grasp")
     runs = [load_run(stored.folder / "runs", name) for name in RUNS]
-    clock = new["clock"]["nothing kept"]
-    published = [vars(row) for row in load_run(stored.folder / "runs", PUBLISHED).rows]
-    batch, planned = load_run(stored.folder / "runs", BATCH), stored["plan-farther-sides-batch-h200"]
-    frictions = {"same": "X1", "half": "X5", "double": "X2"}
+    planned, searched = stored["plan-farther-sides-batch-h200"], stored["searcher-h200"]["rows"]
     starts = stored["scenes-start-cpu"]["summary"]
     return {
-        **{"new": new, "paper": paper, "batch": batch.lines[0]},
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
-        **default_rates(*runs, beside=load_run(stored.folder / "runs", BEFORE)),
-        "published": with_interval(published, "retrieved"),
-        "paper_rates": paper_rates(paper["episodes"]),
+        **default_rates(*runs),
         "pushes": pushes(stored),
         "perception": perception(stored),
         "real": real_images(stored),
         "real_kinds": real_kinds(stored),
-        "batch_decision": 1000 * sum(row.planning_seconds for row in batch.rows) / sum(row.steps for row in batch.rows),
         "at_once": planned["shapes"]["batch"] / planned["median_seconds"],
-        "batch_ready": clock["all compiled [s]"],
-        "batch_seconds": clock["last episode [s]"] - clock["all compiled [s]"],
-        **{
-            f"friction_{name}": share(reached(stored.run("trials-frictions-cpu", run)["episodes"], "retrieved"))
-            for name, run in frictions.items()
-        },
+        "searches": len(searched),
+        "searcher_retrieved": sum(row[3] for row in searched),
+        "episodes_retrieved": sum(row[1] for row in searched),
         "starts": sum(each["scenes"] for each in starts),
         "starts_ruled_out": sum(each["truth_ruled_out"] for each in starts),
         "in_sight": sum(

@@ -78,8 +78,7 @@ ABOUT: dict[str, About] = {
     "development": About(
         "for trying things",
         "Made as [`c2`](c2.md) is, for trying things and choosing settings: look at these scenes as often as you like. "
-        "[The guard](../commands.md#the-guard) "
-        "and ablations run on them. Rates here are biased towards what was chosen.",
+        "The guard and ablations run on them. Rates here are biased towards what was chosen.",
         shown=_EACH,
     ),
     "development-box": About(
@@ -91,8 +90,8 @@ ABOUT: dict[str, About] = {
         "to report with",
         "Nine sets, each to report one larger change with, made as [`c2`](c2.md) is from seeds that no other set has. "
         "Each is used once, because scenes that were looked at are no longer unseen; so no picture of them is shown. "
-        "All nine are used; what each was used for is in the [log](../experiments.md). `report-i` reports what the "
-        "default comes to, and what it comes to where friction and shapes are not known.",
+        "All nine are used. `report-i` reports what the default comes to, and what it comes to where friction and "
+        "shapes are not known.",
         sets=tuple(f"report-{letter}" for letter in "abcdefghi"),
     ),
     **{
@@ -135,8 +134,7 @@ ABOUT: dict[str, About] = {
         "The scenes that the method's authors published with their code: 200, of which 100 were used here, 25 each "
         "with 2, 4, 6 and 8 objects. Settings were chosen on them. Their repository names no licence: so they are no "
         "named set, no picture of them is shown, and who has a copy [imports it](../method.md#the-published-scenes).",
-        "By the authors, in PyBullet. In three of the 100 used [the target shows more than 100 "
-        "pixels](../experiments.md#what-scenes-are-like) at the start.",
+        "By the authors, in PyBullet. In three of the 100 used the target shows more than 100 pixels at the start.",
     ),
 }
 

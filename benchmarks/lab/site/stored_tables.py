@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PaperTable
@@ -17,7 +17,6 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
     Setting,
     origin_of,
 )
-from mechsearch_jax.benchmarks.statistics.preset_names import FORMER_STANDARDS
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, EpisodeRow, episode_key
 from mechsearch_jax.benchmarks.store.runs import StoredRun, variant_of
 from mechsearch_jax.envs.scenes.scene_sets import find_scene
@@ -50,8 +49,7 @@ def setting_of(line: Mapping[str, Any]) -> Setting | None:
 def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
     """The rows of an experiment in stored runs.
 
-    Of every setting those of the newest run that has it, with its code and the simulator that most of them ran in. A
-    former default is left out where a later one has the cell.
+    Of every setting those of the newest run that has it, with its code and the simulator that most of them ran in.
     """
     rows: dict[Setting, dict[str, EpisodeRow]] = {}
     for run in runs_of(table, runs):
@@ -64,14 +62,7 @@ def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
                 origin_of(next(iter(there.values()))) if there else Counter(map(origin_of, own)).most_common(1)[0][0]
             )
             rows[setting] = {episode_key(row): row for row in own if origin_of(row) == shown} | there
-    ordered = sorted((setting for setting in rows if not _is_outdated(setting, rows)), key=_order)
-    return Results(table, {setting: list(rows[setting].values()) for setting in ordered})
-
-
-def _is_outdated(setting: Setting, settings: Collection[Setting]) -> bool:
-    defaults = ("standard", *FORMER_STANDARDS)
-    later = defaults[: defaults.index(setting.preset)] if setting.preset in defaults else ()
-    return any(setting._replace(preset=preset) in settings for preset in later)
+    return Results(table, {setting: list(rows[setting].values()) for setting in sorted(rows, key=_order)})
 
 
 def _rows_of(table: PaperTable, run: StoredRun) -> list[tuple[Setting, EpisodeRow]]:
