@@ -28,7 +28,7 @@ PAGES = [
 ]
 # Pages of which all that they tell to do is done, in order; and those whose lines of Python are run.
 DONE = ("start.md", "camera.md", "robot.md")
-RUN = ("python.md", "extend.md")
+RUN = ("docs/python.md", "docs/extend.md", "CONTRIBUTING.md")
 # Programs that are not ours.
 OTHERS = {"pip", "git", "ray", "source", "pytest", "mkdocs", "wait", "search_node.py"}
 # Words of the shell in front of a command, and what stands for a value in it.
@@ -69,7 +69,10 @@ def named(page):
 def test_every_block_is_of_a_kind_that_is_tested():
     kinds = {(language, page.name) for page in PAGES for language, _ in blocks(page)}
     assert {language for language, _ in kinds} == {"bash", "sh", "toml", "python", "json"}
-    assert {name for language, name in kinds if language == "python"} == {"README.md", "robot.md", *RUN}
+    assert {name for language, name in kinds if language == "python"} == {
+        *("README.md", "robot.md"),
+        *(Path(page).name for page in RUN),
+    }
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if any(commands(page))], ids=named)
@@ -147,7 +150,7 @@ def test_settings_in_files_are_read(tmp_path):
 @pytest.mark.parametrize("page", RUN)
 def test_python_runs_as_it_stands(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code = [text for language, text in blocks(ROOT / "docs" / page) if language == "python"]
+    code = [text for language, text in blocks(ROOT / page) if language == "python"]
     # Classes in it are pytrees, and look for the module that they are defined in.
     exec(compile("\n".join(code), page, "exec"), {"__name__": "guide"})
 

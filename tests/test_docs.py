@@ -224,6 +224,22 @@ def test_the_rates_of_the_readme_are_the_stored_ones():
         assert figures == expected
 
 
+def test_the_other_figures_of_the_readme_are_the_stored_ones():
+    text = read("README.md")
+    seconds = json.loads((RESULTS / "plan-farther-sides-trials-cpu.json").read_text())["median_seconds"]
+    assert f"[{1000 * seconds:.0f} ms on two CPU cores]" in text
+    things, assumed, drawn = (
+        unseen_line(load_run(RESULTS / "runs", f"report-{name}-h200"), 8, **settings)["retrieved"]["rate"]
+        for name, settings in (
+            ("household-bases", {"recognition": "full-parts"}),
+            ("i", {}),
+            ("i-worlds", {"mismatch.friction_spread": 2.0, "mismatch.mass_spread": 2.0}),
+        )
+    )
+    assert f"[{things:.2f}](docs/results.md#household-things)" in text
+    assert f"[{100 * (assumed - drawn):.1f} points fewer](docs/results.md#worlds-that-are-not-as-assumed)" in text
+
+
 def test_stored_scenes_are_those_on_record():
     stored = json.loads((ROOT / "benchmarks/results/scenes-cpu.json").read_text())
     made = {(row[1], row[2]) for row in stored["rows"] if row[0] in SETS}
