@@ -101,11 +101,6 @@ def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:
     return table
 
 
-def _detected(line: Mapping[str, Any]) -> list[str]:
-    shares = ("-" if line[name] is None else f"{line[name]:.3f}" for name in ("precision", "recall"))
-    return [f"{line['missed']}/{line['in_sight']}", f"{line['false']}/{line['out_of_sight']}", *shares]
-
-
 def agreement_table(agreement: Agreement) -> Table:
     """How well two simulators agree: a column for each kind of action."""
     summary = agreement.summary()
