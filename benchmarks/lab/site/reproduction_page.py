@@ -41,6 +41,10 @@ def _share(rate: Mapping[str, Any] | None) -> str:
     return "-" if rate is None else with_interval(rate["rate"], rate["interval"], "{:.2f}")
 
 
+def _rate(rate: Mapping[str, Any] | None) -> str:
+    return "-" if rate is None else f"{rate['rate']:.2f}"
+
+
 def _table(header: Sequence[str], lines: Sequence[Sequence[object]], constant: Sequence[str] = ()) -> str:
     """The table, without columns that say nothing, and without those of these names that say one thing throughout."""
     columns = [[str(line[i]) for line in lines] for i in range(len(header))]
@@ -53,7 +57,7 @@ def _table(header: Sequence[str], lines: Sequence[Sequence[object]], constant: S
 
 
 def _paper(value: float | None) -> str:
-    return "-" if value is None else f"{value:g}"
+    return "-" if value is None else f"{value:.2f}"
 
 
 def runs_table(runs: Sequence[StoredRun], tables: Mapping[str, Results]) -> str:
@@ -132,15 +136,16 @@ def cells_table(results: Results) -> str:
             continue
         setting, paper = cell.setting, cell.paper
         own = [row for row in results.rows[setting] if row.objects == cell.objects]
-        rates = rates_of(own)
+        rates, goal = rates_of(own), goal_of("grasp", setting, own[0])
+        shares = {name: (_share if name == goal else _rate)(rates[name]) for name in ("graspable", "retrieved")}
         errors = sum(row.is_error for row in own)
         lines.append(
             [
                 *_cell(setting, cell.objects),
                 f"{len(own)}" + (f", {errors} errors" if errors else ""),
-                *(_share(rates["found"]), _paper(paper.find)),
-                *(_share(rates["graspable"]), _grasp(setting, own, paper.grasp)),
-                _share(rates["retrieved"]),
+                *(_rate(rates["found"]), _paper(paper.find)),
+                *(shares["graspable"], _grasp(setting, own, paper.grasp)),
+                shares["retrieved"],
                 *(_steps(cell.find_steps), _paper(paper.find_steps)),
                 *(_steps(cell.grasp_steps), _grasp(setting, own, paper.grasp_steps)),
             ]

@@ -219,8 +219,8 @@ def default_rates(today: StoredRun, worlds: StoredRun, household: StoredRun) -> 
             {
                 "`report-i`, true shapes": _episodes(true),
                 "`report-i`, `full`": _episodes(full),
-                **{f"`report-i`, {name}": _episodes(rows) for name, rows in other.items()},
-                **{f"`report-household`, {name}": _episodes(rows) for name, rows in things.items()},
+                "`report-i`, friction and mass not as assumed": _episodes(next(iter(other.values()))),
+                "`report-household`, `full-parts`": _episodes(things["`full-parts`"]),
             }
         ),
         "household_rates": rates("seen", {name: _episodes(rows) for name, rows in things.items()}),
