@@ -79,19 +79,15 @@ IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
     "mechsearch bench": (
         "agreement",
         "bodies",
-        "calibration",
         "ceiling",
         "cell",
         "confidence",
-        "detection",
         "looks",
         "push",
-        "reach",
         "recognition",
         "scenes",
         "segmentation",
         "sensors",
-        "targets",
     ),
 }
 
