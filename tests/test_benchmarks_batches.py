@@ -19,7 +19,6 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.planner import PRESETS, policies
@@ -263,12 +262,8 @@ def test_beside_a_gpu_a_batch_tries_actions_out_in_processes_that_end_with_it(mo
         assert batches._trials(stack, "none") is None
         trials = batches._trials(stack, "physics")
         assert isinstance(trials, ProcessTrials)
-        learning = batches._trials(stack, "learning", 0.03)
-        assert isinstance(learning, LearningTrials)
-        assert isinstance(learning.trials, ProcessTrials)
-        assert learning.arm_stop == 0.03
         assert closed == []
-    assert closed == [learning.trials, trials]
+    assert closed == [trials]
 
 
 def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):

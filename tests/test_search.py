@@ -23,7 +23,6 @@ from mechsearch_jax.envs.cell.loading import load_searcher
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.pushing.physics_push import NativePhysics
-from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
@@ -303,10 +302,6 @@ def test_what_a_policy_does_not_propose_cannot_be_tried(problem):
 
 
 def test_an_option_that_would_have_no_effect_is_refused():
-    for policy in (None, search_for_grasp(tries=True)):
-        with pytest.raises(InputError, match=r"others that learn nothing are given; give trials=LearningTrials\(\)"):
-            Searcher(config=standard(trials="learning"), trials=NativeTrials(), policy=policy)
-    Searcher(config=standard(trials="learning"), trials=LearningTrials())
     with pytest.raises(InputError, match='config names the push model "quasi-static", and another is given'):
         Searcher(config=standard(trials="none", push_model="quasi-static"), push_model=own_push_model("learned"))
 
@@ -318,7 +313,6 @@ def test_what_a_configuration_names_is_what_decides_by_default():
     quiet = dataclasses.replace(method, config=method.config.with_options(retrieval_contact=False))
     assert searcher.config == quiet.config
     assert (searcher._policy, searcher._trials) == (quiet.policy(), quiet.trials())
-    assert isinstance(Searcher(config=standard(trials="learning"))._trials, LearningTrials)
     physics = Searcher(config=standard(trials="none", push_model="physics"))
     assert physics._trials is None
     assert isinstance(physics._policy.predict.push_model, NativePhysics)

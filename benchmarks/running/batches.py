@@ -18,7 +18,6 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.simulators.named import EngineName, new_simulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
-from mechsearch_jax.envs.trials.learning import LearningTrials
 from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
@@ -115,7 +114,7 @@ class Batches:
             while batches:
                 batch = batches.pop()
                 try:
-                    trials = trying(*method.trials_arguments)
+                    trials = trying(method.config.trials)
                     self._run(batch, failures.ended, _Means(target, method, simulator, worlds, trials))
                 except InputError:
                     raise
@@ -164,15 +163,14 @@ class Batches:
         )
 
 
-def _trials(stack: contextlib.ExitStack, name: str, arm_stop: float = 0.0) -> Trials | None:
+def _trials(stack: contextlib.ExitStack, name: str) -> Trials | None:
     """What tries actions out, as `named_trials`, in processes of its own beside a GPU; ended with the stack."""
-    trials = named_trials(name, arm_stop)
-    native = trials.trials if isinstance(trials, LearningTrials) else trials
-    if jax.default_backend() == "cpu" or not isinstance(native, NativeTrials):
+    trials = named_trials(name)
+    if jax.default_backend() == "cpu" or not isinstance(trials, NativeTrials):
         return trials
-    apart = ProcessTrials(native)
+    apart = ProcessTrials(trials)
     stack.callback(apart.close)
-    return dataclasses.replace(trials, trials=apart) if isinstance(trials, LearningTrials) else apart
+    return apart
 
 
 class _Batch:

@@ -21,7 +21,6 @@ from mechsearch_jax.envs.episode.slots import BeliefSummary, is_blind, may_be_bl
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.planner import Decision, Policy, Problem, initial_belief
-from mechsearch_jax.planner.learning import LearnedFriction, LearnsFriction
 from mechsearch_jax.planner.step import SearchState, believe, propose, unsearched
 from mechsearch_jax.planner.trials import TrialResult, Trials, TrialScenes, TwoStagePolicy, choose, scenes_of
 from mechsearch_jax.runtime.compiled import cached_jit
@@ -89,7 +88,6 @@ class ManySlots:
         sensing: of any slot, for what recognisers make of it.
         """
         self._problem, self._trials = problem, trials
-        self._learned = LearnedFriction(trials, len(world.kind)) if isinstance(trials, LearnsFriction) else None
         self._policy, self._compile_key = as_pytree(policy), compile_key(policy)
         self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf, problem.target)
         self._at_once = at_once
@@ -152,8 +150,6 @@ class ManySlots:
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """See `Slots`."""
         self._state = _forget(self._problem, self._state, jax.device_put(np.asarray(fresh)))
-        if self._learned is not None:
-            self._learned.forget(fresh)
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`."""
@@ -177,15 +173,11 @@ class ManySlots:
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
-        before = self._state.search
         for _, padded in self._chunks(rows):
             self._state = _look(
                 self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
             )
         now = self._state.search
-        if self._learned is not None:
-            searches = scenes_of(before.belief, before.observation), before.action, now.observation.objects
-            self._learned.learn(self._problem, rows, *jax.tree.map(lambda a: a[list(rows)], jax.device_get(searches)))
         return summary(self._problem, now.belief, self._state.truth, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int], last: Collection[int] = ()) -> dict[int, Choice]:
@@ -241,8 +233,7 @@ class ManySlots:
             for count, (decision, scenes) in zip(counts, proposed, strict=True)
         ]
         scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
-        trials = self._trials if self._learned is None else self._learned.trials([r for chunk in chunks for r in chunk])
-        results = trials(self._problem, scenes, alternatives.actions, alternatives.worth)
+        results = self._trials(self._problem, scenes, alternatives.actions, alternatives.worth)
         blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
         parts = np.split(results, np.cumsum(counts)[:-1])
         return [np.concatenate([part, blank[len(part) :]]).astype(np.int32) for part in parts]

@@ -68,12 +68,7 @@ class Method:
 
     def trials(self) -> Trials | None:
         """The trials of the policy's best actions; None without trials."""
-        return named_trials(*self.trials_arguments)
-
-    @property
-    def trials_arguments(self) -> tuple[str, float]:
-        """The arguments of `named_trials`: the trials' name, and for those that learn where the arm stops [rad]."""
-        return self.config.trials, self.mismatch.arm_stop if self.config.trials == "learning" else 0.0
+        return named_trials(self.config.trials)
 
     def recogniser(self, target: Target) -> Recogniser:
         """The recogniser of its episodes with a target.
@@ -93,7 +88,7 @@ class Method:
           InputError: as `policy`.
         """
         shared = self.workcell, self.config.problem, self.recognition, self.engine
-        return *shared, self.trials_arguments, self.mismatch.compile_key(), compile_key(self.policy())
+        return *shared, self.config.trials, self.mismatch.compile_key(), compile_key(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.

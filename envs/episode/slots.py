@@ -24,7 +24,6 @@ from mechsearch_jax.envs.episode.episode_log import Choice, chosen
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.planner import Belief, Policy, Problem
-from mechsearch_jax.planner.learning import restored
 from mechsearch_jax.planner.step import Decided, SearchState, believe, decide, unsearched
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.compiled import cached_jit
@@ -124,15 +123,12 @@ class OneSlot:
         self.truth: Truth | None = None
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
-        self._learned = restored(trials, {})
         self._sensing: Sensing | None = None
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
         if fresh[0]:
             self.state, self.truth = None, None
-            if self._learned is not None:
-                self._learned.forget(fresh)
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`; accepts any policy."""
@@ -148,8 +144,6 @@ class OneSlot:
         snapshot = dataclasses.replace(self._snapshot(world), sensing=self._sensing)
         observation = self._recogniser(keys[0], snapshot)
         before = unsearched(self._problem, observation) if self.state is None else self.state
-        if self._learned is not None:
-            self._learned.learn_first(self._problem, before, observation)
         self.state = believe(self._problem, before, observation)
         truth = truth_of(self._recogniser, snapshot, observation)
         self.truth = truth if self.truth is None else truth.since(self.truth, observation)
@@ -162,8 +156,7 @@ class OneSlot:
         if not rows:
             return {}
         assert self.state is not None
-        trials = self._trials if self._learned is None else self._learned.trials([0])
-        self.decided = decide(self._policy, trials, keys[0], self._problem, self.state, last=0 in last)
+        self.decided = decide(self._policy, self._trials, keys[0], self._problem, self.state, last=0 in last)
         self.state = self.state.replace(action=self.decided.decision.action)
         choice = chosen(self.decided.decision)
         if may_be_blind(self.state.belief):

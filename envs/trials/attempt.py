@@ -72,7 +72,6 @@ class TrialScene(NativeWorld):
         bodies: list[Body | None],
         friction: float = 1.0,
         mass: float = 1.0,
-        origins: Float[np.ndarray, "9 3"] | None = None,
     ):
         """Let bodies come to rest.
 
@@ -81,13 +80,11 @@ class TrialScene(NativeWorld):
           config: of the simulation.
           bodies: in their slots.
           friction, mass: factors on all sliding frictions, and on the bodies' masses.
-          origins: of the objects' frames in those of the bodies [m]; at the bodies' own if None.
 
         Raises:
           ValueError, mujoco.FatalError: MuJoCo cannot build the scene.
         """
         super().__init__(shelf, config=config, blank=blank_model(shelf, config.motion.timestep))
-        self._origins = np.zeros((BODIES, 3)) if origins is None else origins
         self.place(bodies, TrueCell(friction, mass))
         self._model.opt.sleep_tolerance = config.rest_speed
         self._hide_what_is_no_body()
@@ -114,39 +111,6 @@ class TrialScene(NativeWorld):
         scene._data = copy.copy(self._data)
         scene._record()
         return scene._attempted(kind, reference, index, needed)
-
-    def ends(self, kind: Kind, reference: Reference, arm_stop: float) -> Float[np.ndarray, "2 9 3"]:
-        """Where the bodies come to rest after a motion, in two ways [m]. Uses no JAX.
-
-        Bodies off the board are infinitely far; all is NaN if the simulation diverges.
-        The first is of an arm that goes on where it is held up, the second of one that stops there and goes back.
-
-        Args:
-          kind: of the action.
-          reference: of the arm, as NumPy arrays.
-          arm_stop: error of a joint at which the arm may stop [rad].
-        """
-        on, farthest = self._end(kind, reference, None)
-        return np.stack([on, self._end(kind, reference, arm_stop)[0] if farthest > arm_stop else on])
-
-    def _end(self, kind: Kind, reference: Reference, arm_stop: float | None) -> tuple[Float[np.ndarray, "9 3"], float]:
-        """Where the bodies come to rest [m], and the tracking error [rad]; an arm without a stop goes on."""
-        scene = copy.copy(self)
-        scene._data = copy.copy(self._data)
-        scene._record()
-        if arm_stop is None:
-            states, stopped = scene._follow(reference), False
-        else:
-            states, stopped = scene._guarded(reference, arm_stop)
-        if kind.returns_home or stopped:
-            scene._go_home()
-        scene._rest_again(np.empty((0, 0)))
-        poses = scene._data.qpos[ROBOT:].reshape(BODIES, 7)
-        places = poses[:, :3] + np.einsum("nij,nj->ni", rotation_matrix(poses[:, 3:]), self._origins)
-        places[scene._fallen()] = np.inf
-        if self.diverged or scene._recorder.diverged:
-            places[:] = np.nan
-        return places, self._tracking_error(states, reference)
 
     def _attempted(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]

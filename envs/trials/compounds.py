@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.pushing.physics_push import THINNEST
-from mechsearch_jax.envs.world.world import BODIES, TARGET, body_at
+from mechsearch_jax.envs.world.world import TARGET, body_at
 from mechsearch_jax.geometry.superquadric import ROUND_EXPONENT, Superquadrics
 from mechsearch_jax.shapes import PRIMITIVES, shape_of
 from mechsearch_jax.shapes.compound import COMPOUND, Compound, Piece, centred, half_extents
@@ -77,22 +77,17 @@ def _base(pieces: Sequence[Piece], up: Float[np.ndarray, " 3"]) -> list[Piece]:
     return [Piece("cylinder", (radius, radius, BASE_THICKNESS / 2), (x, y, z), quaternion)]  # pyright: ignore
 
 
-def with_parts(
-    bodies: Sequence[Body | None], objects: Superquadrics
-) -> tuple[list[Body | None], Float[np.ndarray, "9 3"]]:
+def with_parts(bodies: Sequence[Body | None], objects: Superquadrics) -> list[Body | None]:
     """The bodies of recognised objects, with those of several parts as compounds.
 
     Args:
       bodies: in their slots, each the body nearest to an object's bounding superquadric.
       objects: recognised, as NumPy arrays.
-
-    Returns:
-      The bodies, and where the origin of each object's frame is in the frame of its body [m].
     """
-    made, origins = list(bodies), np.zeros((BODIES, 3))
+    made = list(bodies)
     parts: Any = objects.parts
     if parts is None:
-        return made, origins
+        return made
     for i in np.flatnonzero(objects.valid & (parts.valid.sum(axis=-1) > 1)):
         own: Any = Superquadrics(*(getattr(parts, name)[i] for name in _FIELDS))
         compound, centre = centred(compound_of(own, np.asarray(objects.rotation[i], float)[2]))
@@ -103,8 +98,7 @@ def with_parts(
         made[i] = dataclasses.replace(
             body, shape=COMPOUND, half_size=half_extents(compound), position=(x, y, z), compound=compound
         )
-        origins[i] = -centre
-    return made, origins
+    return made
 
 
 def with_target(bodies: Sequence[Body | None], target: Target) -> list[Body | None]:

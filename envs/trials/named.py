@@ -9,24 +9,20 @@ from mechsearch_jax.runtime.errors import InputError
 
 
 @functools.cache
-def named_trials(name: str, arm_stop: float = 0.0) -> Trials | None:
-    """The `Trials` of a name; the same object for the same arguments.
+def named_trials(name: str) -> Trials | None:
+    """The `Trials` of a name; the same object for the same name.
 
     Args:
-      name: "physics" for a simulation, "learning" for one that learns the friction as the search goes, "none" for None.
-      arm_stop: error of a joint at which the robot's controller stops the arm [rad], for "learning"; 0 if it has none.
+      name: "physics" for a simulation, "none" for None.
 
     Raises:
       InputError: there is nothing of that name.
     """
     if name == "none":
         return None
-    if name not in ("physics", "learning"):
-        raise InputError(f'trials "{name}" is unknown; use none, physics, learning')
+    if name != "physics":
+        raise InputError(f'trials "{name}" is unknown; use none, physics')
     # Imported here so that "none" does without the simulator.
-    from mechsearch_jax.envs.trials.learning import LearningTrials
     from mechsearch_jax.envs.trials.native import NativeTrials
 
-    if name == "physics":
-        return NativeTrials()
-    return LearningTrials(arm_stop=arm_stop) if arm_stop else LearningTrials()
+    return NativeTrials()

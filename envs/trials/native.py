@@ -16,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -130,51 +129,6 @@ class NativeTrials:
 
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
 
-    def ends(
-        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
-    ) -> Float[np.ndarray, "r 2 n 3"]:
-        """Where the objects' centres come to rest after an action in each scene [m].
-
-        Objects off the board are infinitely far; all is NaN where the action cannot be simulated.
-        Twice: if an arm that is held up goes on, and if it stops and goes back the way it came.
-
-        Args:
-          problem: constants of the search.
-          scenes: R scenes.
-          actions: one for each, of a kind that moves the arm.
-          arm_stop: error of a joint at which the arm may stop [rad].
-        """
-        return self.ends_in_cell(TrialSetup(problem.target, problem.shelf, problem.gripper), scenes, actions, arm_stop)
-
-    def ends_in_cell(
-        self, cell: TrialSetup, scenes: TrialScenes, actions: Action, arm_stop: float
-    ) -> Float[np.ndarray, "r 2 n 3"]:
-        """`ends` without a problem."""
-        simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
-        actions, scenes = jax.device_get((actions, scenes))
-
-        def end(row: int) -> Float[np.ndarray, "2 n 3"]:
-            # What is left out stays.
-            places = np.stack([np.asarray(scenes.objects.position[row])] * 2)
-            nowhere = np.full_like(places, np.nan)
-            action: Action = jax.tree.map(lambda a: np.asarray(a[row]), actions)
-            kept = near_path(jax.tree.map(lambda a: a[row], scenes.objects), action, cell.gripper.approach)
-            kind = kind_of(int(action.kind))
-            motion = jax.device_get(reference_motion(kind, action, simulation.motion))
-            world, scene = self._scene(cell, simulation, scenes, row, kept)
-            if motion is None or not motion[1] or scene is None:
-                return nowhere
-            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (world, motion[0]))):
-                return nowhere
-            try:
-                places[:, kept] = scene.ends(kind, motion[0], arm_stop)[:, : len(kept)]
-            except mujoco.FatalError:
-                return nowhere
-            return places
-
-        with ThreadPoolExecutor(self.threads or cores()) as pool:
-            return np.stack(list(pool.map(end, range(len(scenes.found)))))
-
     def _scene(
         self, cell: TrialSetup, simulation: SimulatorConfig, scenes: TrialScenes, row: int, kept: tuple[int, ...]
     ) -> tuple[World, TrialScene | None]:
@@ -260,7 +214,7 @@ def scene_at_rest(
 ) -> TrialScene | None:
     """A scene at rest; None if MuJoCo cannot build it, so that one invalid scene does not end the other trials."""
     try:
-        made, origins = with_parts(with_target(bodies_of(world), cell.target), objects)
-        return TrialScene(cell.shelf, simulation, made, friction, mass, origins)
+        made = with_parts(with_target(bodies_of(world), cell.target), objects)
+        return TrialScene(cell.shelf, simulation, made, friction, mass)
     except (ValueError, mujoco.FatalError):
         return None

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 
 import jax
 import loky
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.trials.native import NativeTrials, TrialSetup
@@ -57,25 +57,15 @@ class ProcessTrials:
             single = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions, wanted))
             return self._workers().submit(_row, self.trials, cell, *single)
 
-        rows = np.flatnonzero(wanted.any(axis=1)).tolist()
-        unknown = np.full(wanted.shape[1], TrialResult.UNKNOWN, np.int32)
-        for row, result in zip(rows, self._each(begin, rows, f"tried {wanted.shape[1]} actions", unknown), strict=True):
-            results[row] = result
+        rows: list[int] = np.flatnonzero(wanted.any(axis=1)).tolist()
+        try:
+            tried = [future.result() for future in [begin(row) for row in rows]]
+        except BrokenExecutor:
+            self.close()
+            tried = [self._alone(begin, row) for row in rows]
+        for row, result in zip(rows, tried, strict=True):
+            results[row] = TrialResult.UNKNOWN if result is None else result
         return results
-
-    def ends(
-        self, problem: Problem, scenes: TrialScenes, actions: Action, arm_stop: float
-    ) -> Float[np.ndarray, "r 2 n 3"]:
-        """See `NativeTrials.ends`; NaN, with a warning, where the simulation ends its process."""
-        cell = _cell(problem)
-        scenes, actions = jax.device_get((scenes, actions))
-        nowhere = np.full((1, 2, scenes.objects.valid.shape[-1], 3), np.nan, np.float32)
-
-        def begin(row: int) -> Future[Float[np.ndarray, "1 2 n 3"]]:
-            single = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions))
-            return self._workers().submit(_ends, self.trials, cell, *single, arm_stop)
-
-        return np.concatenate(self._each(begin, range(len(scenes.found)), "simulated an action", nowhere))
 
     def programs(self, problem: Problem) -> list[Program]:
         """A program that starts the processes and prepares each; see `many_slots.PreparesTrials`."""
@@ -106,36 +96,17 @@ class ProcessTrials:
             self._pool = workers(self.processes)
         return self._pool
 
-    def _each(
-        self, begin: Callable[[int], Future[np.ndarray]], rows: Sequence[int], what: str, unknown: np.ndarray
-    ) -> list[np.ndarray]:
-        """The results of all rows, each alone if a process dies, and `unknown`, with a warning, if it dies again.
-
-        Args:
-          begin: submits the work of a row.
-          rows: to begin.
-          what: a process did, for the warning.
-          unknown: the result of a row that ends its process.
-        """
-        try:
-            pending = [begin(row) for row in rows]
-            return [future.result() for future in pending]
-        except BrokenExecutor:
-            self.close()
-        return [self._alone(begin, row, what, unknown) for row in rows]
-
-    def _alone(
-        self, begin: Callable[[int], Future[np.ndarray]], row: int, what: str, unknown: np.ndarray
-    ) -> np.ndarray:
-        """The result of a row while no other is worked on."""
+    def _alone(self, begin: Callable[[int], Future[Int[np.ndarray, " k"]]], row: int) -> Int[np.ndarray, " k"] | None:
+        """The results of a row while no other is worked on; None, with a warning, if its process dies again."""
         try:
             return begin(row).result()
         except BrokenExecutor as error:
             self.close()
             warnings.warn(
-                f"a process died as it {what} ({type(error).__name__}); what comes of that is not known", stacklevel=4
+                f"a process died as it tried actions ({type(error).__name__}); what comes of them is not known",
+                stacklevel=3,
             )
-            return unknown
+            return None
 
 
 def _cell(problem: Problem) -> TrialSetup:
@@ -155,10 +126,3 @@ def _row(
 ) -> Int[np.ndarray, " k"]:
     """The results of the actions of a single scene."""
     return trials.in_cell(cell, scenes, actions, wanted)[0]
-
-
-def _ends(
-    trials: NativeTrials, cell: TrialSetup, scenes: TrialScenes, actions: Action, arm_stop: float
-) -> Float[np.ndarray, "1 2 n 3"]:
-    """Where the objects of a single scene come to rest."""
-    return trials.ends_in_cell(cell, scenes, actions, arm_stop)

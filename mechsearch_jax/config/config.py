@@ -22,7 +22,7 @@ from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import DEGREES, in_degrees, in_radians, option
 
-TrialsName = Literal["none", "physics", "learning"]
+TrialsName = Literal["none", "physics"]
 
 
 class Weights(NamedTuple):
@@ -157,7 +157,7 @@ class Config:
     )
     trials: TrialsName = option(
         "physics",
-        "what tries the best few actions out before one is made: nothing, a simulation, one that learns the friction",
+        "what tries the best few actions out before one is made: nothing, or a simulation",
         get_args(TrialsName),
     )
     max_steps: int = option(10, "actions in an episode")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.planner.learning import LearnsFriction
 from mechsearch_jax.planner.policies import PlanningPolicy, Policy, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
@@ -41,11 +40,6 @@ def policy_and_trials(
     """
     models = {"push_model": push_model, "later_push_model": later_push_model}
     given = [name for name, model in models.items() if model is not None]
-    if config.trials == "learning" and trials is not None and not isinstance(trials, LearnsFriction):
-        raise InputError(
-            'Searcher: config names the trials "learning", and others that learn nothing are given; give '
-            'trials=LearningTrials() (envs.trials.learning), or a config with trials="physics"'
-        )
     if policy is not None:
         if given:
             raise InputError(

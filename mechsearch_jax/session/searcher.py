@@ -36,7 +36,6 @@ from mechsearch_jax.images.colour import RED
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.plausibility import EMPTY_SHELF, sight_faults
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.planner.learning import LearnedFriction, restored
 from mechsearch_jax.planner.policies import PlanningPolicy, Policy
 from mechsearch_jax.planner.rollout import no_decision
 from mechsearch_jax.planner.state import Decision
@@ -325,11 +324,9 @@ class Searcher:
             before = before.replace(observation=observation, action=no_action())
         state = believe(problem, before, observation)
         warnings += faults.belief_warnings(now.belief, state.belief, shelf_is_empty=EMPTY_SHELF in unseen)
-        learned = self._learned(before, observation)
-        trials = self._trials if learned is None else learned.trials([0])
         first = self._held(observation, present) or self._way_out(observation, present)
         if first is None:
-            decided, motion = self._decide(decision_key, trials, state, images.depth, unseen, present)
+            decided, motion = self._decide(decision_key, self._trials, state, images.depth, unseen, present)
         else:
             decided, motion = Decided(no_decision(observation.objects), nothing_tried()), first
         warnings += motion.warnings
@@ -348,7 +345,7 @@ class Searcher:
             image=display_image(images.depth, images.colour),
         )
         if first is None:
-            self._keep(step, learned)
+            self._keep(step)
         elif first.trajectory is not None:
             # The arm, or what it holds, hides things: nothing else of this look counts.
             action = now.action if now.acted else no_action()
@@ -382,7 +379,7 @@ class Searcher:
         before = Observation(now.observation.objects, found, pose, now.observation.confidence)
         return self.recogniser.unchecked(key, *images, before=expected(before, action))
 
-    def _keep(self, step: SearchStep, learned: LearnedFriction | None) -> None:
+    def _keep(self, step: SearchStep) -> None:
         """Keep of a step what the next one needs."""
         handed = step.trajectory is not None
         self._state = State(
@@ -396,7 +393,6 @@ class Searcher:
             refusals=self._now.refusals + (not handed),
             failures=self._now.failures,
             stopped=self._now.stopped,
-            hypothesis_probabilities={} if learned is None else learned.first,
         )
 
     def _present(self, joints: Any, width: Any) -> Present:
@@ -421,17 +417,6 @@ class Searcher:
             joints = np.asarray(joints, float)
             check_joints("joints", joints, self.workcell.gripper.arm)
         return joints
-
-    def _learned(self, before: SearchState, observation: Observation) -> LearnedFriction | None:
-        """What trials have learned from all executed actions, with the last images; None if they do not learn.
-
-        An action that was broken off is not what is simulated, and teaches nothing.
-        """
-        now = self._now
-        learned = restored(self._trials, now.hypothesis_probabilities)
-        if learned is not None and now.acted and now.executed:
-            learned.learn_first(self.problem, before, observation)
-        return learned
 
     def _without_arm(self, depth: np.ndarray, joints: Float[np.ndarray, " 7"]) -> np.ndarray:
         """A depth image in which the arm counts as not measured; other arrays, which are refused later, unchanged."""
@@ -579,10 +564,9 @@ class Searcher:
         """Report that the last step's motion is over, after a failure, too: the hand may have moved something unseen.
 
         Args:
-          ok: whether it was executed to its end. A retrieval that was finishes the search; trials that learn do so from
-            other actions that were. A retrieval that was reported as failed, after which the target is in the hand
-            nevertheless, may be reported again. After a way out of the shelf, or the way back of an object, what was
-            reported of the action before it still holds.
+          ok: whether it was executed to its end. A retrieval that was finishes the search. One that was reported as
+            failed, after which the target is in the hand nevertheless, may be reported again. After a way out of the
+            shelf, or the way back of an object, what was reported of the action before it still holds.
           joints: where the arm stopped, seven angles [rad], if that is not where the motion ends: `next` takes it to be
             there unless it is told otherwise, and takes it out of the shelf first.
 
@@ -630,15 +614,9 @@ class Searcher:
         The hand, the camera's pose, the arm's speed, obstacles and the target's place may have changed.
 
         Raises:
-          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher, or to trials that
-            learn of other hypotheses.
+          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher.
         """
-        state = load_state(self.problem, self._digest, path, self.workcell.capacity)
-        try:
-            restored(self._trials, state.hypothesis_probabilities)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        self._state = state
+        self._state = load_state(self.problem, self._digest, path, self.workcell.capacity)
 
     @functools.cached_property
     def _view_warnings(self) -> tuple[str, ...]:

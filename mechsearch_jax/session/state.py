@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -43,8 +43,6 @@ class State:
       failures: places of the gripper in actions that failed since the last grasp that did not, [m].
       way: name of the motion that was returned, where it only clears the hand after `action`; else empty.
       stopped: joint angles at which the last motion was broken off [rad]; empty if it was not, or that is not known.
-      hypothesis_probabilities: what trials that learn hold of each hypothesis by its name, see
-        `planner.learning.LearnsFriction`; empty if they do not learn, or have not yet.
     """
 
     index: int
@@ -59,7 +57,6 @@ class State:
     failures: tuple[tuple[float, ...], ...] = ()
     stopped: tuple[float, ...] = ()
     way: str = ""
-    hypothesis_probabilities: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 _PLAIN: dict[str, Callable[[Any], Any]] = {
@@ -72,10 +69,9 @@ _PLAIN: dict[str, Callable[[Any], Any]] = {
     "failures": lambda places: tuple(tuple(map(float, place)) for place in places),
     "stopped": lambda joints: tuple(map(float, joints)),
     "way": str,
-    "hypothesis_probabilities": lambda values: {str(name): float(value) for name, value in values.items()},
 }
 # What states hold that were saved before these fields existed.
-_ADDED: dict[str, Any] = {"executed": True, "failures": (), "stopped": (), "way": "", "hypothesis_probabilities": {}}
+_ADDED: dict[str, Any] = {"executed": True, "failures": (), "stopped": (), "way": ""}
 _PYTREES = ("belief", "observation", "action")
 
 

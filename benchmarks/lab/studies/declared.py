@@ -90,7 +90,7 @@ ROBUSTNESS: tuple[Study, ...] = (
             Variant("as assumed"),
             *(
                 Variant(f"drawn, {label}", {"trials": name, "mismatch": _EACH_DRAWN})
-                for label, name in (("assumed", "physics"), ("learned", "learning"), ("no trials", "none"))
+                for label, name in (("assumed", "physics"), ("no trials", "none"))
             ),
         ),
     ),
