@@ -171,7 +171,7 @@ def test_a_grasp_has_to_succeed_in_the_scenes_nearby_too(problem, retrievals):
     assert any(fragile)
 
 
-def test_a_retrieval_is_tried_in_each_scene_nearby_until_it_fails_and_a_push_once(problem, retrievals, monkeypatch):
+def test_a_retrieval_is_tried_in_each_scene_nearby_and_a_push_in_the_first(problem, retrievals, monkeypatch):
     seen, at = objects_and_pose(problem, OPEN)
     grasp, push = jax.tree.map(lambda a: a[:1], retrievals["open"][0].action), stack(pushes()[2])
     for codes, action, result, calls in (
@@ -180,7 +180,10 @@ def test_a_retrieval_is_tried_in_each_scene_nearby_until_it_fails_and_a_push_onc
         ((DONE, UNKNOWN), grasp, UNKNOWN, 2),
         ((DONE,) * 4, grasp, DONE, 4),
         ((FAILED,), grasp, FAILED, 1),
-        ((DONE, FAILED), push, DONE, 1),
+        ((DONE, DONE), push, DONE, 2),
+        ((DONE, FAILED), push, DONE, 2),
+        ((DONE, HARM), push, UNSURE, 2),
+        ((HARM,), push, HARM, 1),
     ):
         said = iter(codes)
         called = []
@@ -286,6 +289,8 @@ def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
         ((HARM, FAILED, DONE, HARM), (2, 1, 3), 1),
         ((FAILED, HARM, FAILED, HARM), (0, 2), 2),
         ((UNKNOWN, FAILED, UNKNOWN, FAILED), (1, 3), 2),
+        ((FAILED, UNSURE, DONE, UNSURE), (2, 0, 1, 3), 0),
+        ((FAILED, HARM, UNSURE, UNSURE), (2, 0, 3), 1),
     ):
         four = (over, aside, higher(over), higher(aside))
         decision = made(proposes(*four), says(*codes), problem, belief, observation)
@@ -562,12 +567,12 @@ def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(prob
     over, away, aside = pushes()
     beliefs, seen = stack(look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM))
     alone = int(np.argmax(retrievals["loose"][1] == DONE))
-    grasps = jax.tree.map(lambda a: a[alone - 1 : alone + 2], retrievals["loose"][0].action)
+    grasps = jax.tree.map(lambda a: a[np.array([alone, alone + 1, alone])], retrievals["loose"][0].action)
     actions = stack(stack(over, away, aside), grasps, grasps)
     wanted = np.array([[True, True, True], [True, True, True], [False, False, False]])
     results = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
     assert results[0].tolist() == [HARM, FAILED, DONE]
-    assert int(np.argmax(results[1] == DONE)) == 1
+    assert results[1][0] == DONE
     assert results[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 

@@ -67,11 +67,12 @@ class NativeTrials:
 
     The same trials always give the same results. An action that the arm cannot follow fails; the result is UNKNOWN if
     the simulation diverges or the scene is invalid. The gripper is the problem's. A retrieval that succeeds
-    is unsure unless it does so in a few scenes near the recognised one as well.
+    is unsure unless it does so in a few scenes near the recognised one as well; another action is if it does harm in
+    the first of these, the roughest.
 
     Attributes:
       simulation: its settings.
-      nearby: the scenes in which a retrieval has to succeed, too.
+      nearby: the scenes in which a retrieval has to succeed, too, and the first of which no other action may harm.
       threads: number of threads; `runtime.cores.cores` if None.
       friction: factor on all sliding frictions; with too low a friction the arm is held up in reality where it was not
         in the trial.
@@ -118,13 +119,19 @@ class NativeTrials:
             if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (near[0, kept][0], motion[0]))):
                 return TrialResult.UNKNOWN
             index = kept.index(int(action.object)) if int(action.object) in kept else TARGET
-            result = TrialResult.UNKNOWN
-            for number in range(1 + self.nearby.scenes * kind.takes_target):
-                if not needed():
-                    return None
-                result = _attempted(near[number, kept][1], kind, motion[0], index, needed)
+
+            def tried(number: int) -> TrialResult | None:
+                return _attempted(near[number, kept][1], kind, motion[0], index, needed) if needed() else None
+
+            result = tried(0)
+            if result is TrialResult.SUCCEEDED and not kind.takes_target:
+                # Where the arm is only held up, the search goes on.
+                harm = self.nearby.scenes > 0 and tried(1) is TrialResult.HARMFUL
+                return TrialResult.UNSURE if harm else result
+            for number in range(1, 1 + self.nearby.scenes * (result is TrialResult.SUCCEEDED)):
+                result = tried(number)
                 if result is not TrialResult.SUCCEEDED:
-                    return TrialResult.UNSURE if number and result is TrialResult.FAILED else result
+                    return TrialResult.UNSURE if result is TrialResult.FAILED else result
             return result
 
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)

@@ -1,4 +1,4 @@
-"""Scenes near a recognised one, in which a grasp of the target has to succeed, too.
+"""Scenes near a recognised one, in which a grasp of the target has to succeed, too, and nothing may do harm.
 
 A grasp that brushes something may take the target out in one scene and be held up in another that is a third of a
 millimetre off, less than recognition can know, or where things are rougher or heavier than assumed. One trial says
@@ -41,7 +41,7 @@ class Perturbations:
     scenes: int = 3
     place: float = 5e-4
     size: float = 5e-3
-    friction: float = 1.5
+    friction: float = 2.0
     mass: float = 1.5
 
     def __post_init__(self):

@@ -41,8 +41,8 @@ class TrialResult(enum.IntEnum):
 
     `UNKNOWN`: it was not tried, or its simulation diverged or had too little room. `HARMFUL`: something leaves the
     board, or the found target falls over. `FAILED`: it is not executed as intended. `SUCCEEDED`: it is; a retrieval
-    takes the target out. `UNSURE`: a retrieval takes the target out of the scene as it is recognised, but fails in one
-    near it, without harm.
+    takes the target out. `UNSURE`: it is in the scene as it is recognised; in one near it a retrieval fails
+    without harm, or another action does harm.
     """
 
     UNKNOWN = 0
@@ -50,6 +50,10 @@ class TrialResult(enum.IntEnum):
     FAILED = 2
     SUCCEEDED = 3
     UNSURE = 4
+
+
+# How good each `TrialResult` is, by its number.
+RANK = (0, 1, 2, 4, 3)
 
 
 class TrialScenes(PyTreeNode):
@@ -206,9 +210,9 @@ def choose(decision: Decision, results: Int[Array, " k"], last: Bool[Array, ""])
 
     A grasp that succeeds is chosen first, or, where no further action is allowed and none does, an unsure one. Else a
     retrieval that the decision already makes is kept if the results of all grasps are unknown. Else the first other
-    alternative that succeeds is chosen, else the first that begins a sequence and did no harm, else nothing. Sequences
-    whose first action did harm, or has an unknown result, or is like one of these, are refused. A decision without
-    alternatives stays unchanged.
+    alternative that succeeds is chosen, else the first that is unsure, else the first that begins a sequence and did no
+    harm, else nothing. Sequences whose first action did harm, or has an unknown result, or is like one of these, are
+    refused. A decision without alternatives stays unchanged.
 
     Args:
       decision: decision of a policy.
@@ -222,10 +226,11 @@ def choose(decision: Decision, results: Int[Array, " k"], last: Bool[Array, ""])
     grasps = alternatives.sequence < 0
     certain = jnp.any(grasps & (results == TrialResult.SUCCEEDED))
     unsure = jnp.where(last & ~certain, TrialResult.SUCCEEDED, TrialResult.FAILED)
-    results = jnp.where(results == TrialResult.UNSURE, unsure, results)
+    results = jnp.where(grasps & (results == TrialResult.UNSURE), unsure, results)
     takes = decision.action.kind == ActionKind.RETRIEVE
     # A grasp counts only if it succeeds.
-    best = jnp.argmax(jnp.where(grasps & (results < TrialResult.SUCCEEDED), -1, results))
+    rank = jnp.array(RANK)[results]
+    best = jnp.argmax(jnp.where(grasps & (results != TrialResult.SUCCEEDED), -1, rank))
     succeeds = results[best] == TrialResult.SUCCEEDED
     harmless = results[best] > TrialResult.HARMFUL
     # Alternatives after the first success were not tried.
