@@ -1,6 +1,10 @@
 """A search that is shown while it runs: what is on the page, and that nothing of the search changes."""
 
 import dataclasses
+import socket
+import threading
+import time
+import urllib.request
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +69,40 @@ def refusing(problem, scenes, actions, wanted):
 
 
 BOX = Observation(jax.tree.map(jnp.asarray, OBJECTS), jnp.array(False), jnp.zeros(3))
+
+
+def test_a_page_says_so_until_there_is_a_decision_and_then_shows_it_at_once(problem, view, monkeypatch):
+    from mechsearch_jax.envs.viewer import live
+
+    waiting, asked, go_on = view._waiting, threading.Event(), threading.Event()
+    assert "No decision yet" in waiting.content
+
+    def slowly(step, tried):
+        asked.set()
+        assert go_on.wait(60)
+        return recorded_step(step, tried)
+
+    recorded_step = live.recorded_step
+    monkeypatch.setattr(live, "recorded_step", slowly)
+    searcher_of(problem, OPEN, view=view).next(IMAGES.depth, IMAGES.colour)
+    assert asked.wait(60)
+    assert node(view._server, "/robot/link7") is None
+    go_on.set()
+    view.wait()
+    assert waiting._impl.removed
+    # Nobody knows the true shapes.
+    assert "off by" not in view.viewer.evidence
+    assert "taken for" in view.viewer.evidence
+
+
+def test_a_connection_that_a_browser_drops_unused_is_no_error(view, caplog):
+    """Browsers open some ahead of need."""
+    address = "127.0.0.1", view._server.get_port()
+    socket.create_connection(address).close()
+    with urllib.request.urlopen("http://{}:{}".format(*address), timeout=30):
+        pass
+    time.sleep(0.3)
+    assert "handshake failed" not in caplog.text
 
 
 def test_decisions_are_the_same_with_a_view_and_it_is_shown_each(problem):

@@ -84,9 +84,9 @@ class Painter:
                 axes.add_patch(patches.Polygon(outline, closed=True, **style))
                 x, y = outline.mean(axis=0)
                 text = drawing.number(axes, (float(x), float(y)), i)
-                # More would cover what it is about.
+                # More would cover what it is about; at the upper edge it stands clear of the number of what is before.
                 if sure < SURE:
-                    text.set_text(f"{i}: {100 * sure:.0f} %")
+                    text.set(text=f"{i}: {100 * sure:.0f} %", y=float(outline[:, 1].min()))
 
         return self._view(draw)
 

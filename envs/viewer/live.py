@@ -28,7 +28,7 @@ from mechsearch_jax.envs.recording.recording import RecordedStep, Recording, emp
 from mechsearch_jax.envs.recording.sampled import sampled
 from mechsearch_jax.envs.recording.step_pictures import Painter
 from mechsearch_jax.envs.recording.step_values import Ending, recognised_shapes, step_values
-from mechsearch_jax.envs.viewer.shown import ShownStep, shown_step
+from mechsearch_jax.envs.viewer.shown import ShownStep, card, shown_step
 from mechsearch_jax.envs.viewer.stage import VISIBLE
 from mechsearch_jax.envs.viewer.viewer import Viewer
 from mechsearch_jax.envs.world.world import TARGET, World, outer_shape, with_target
@@ -69,6 +69,8 @@ class LiveView:
             self._server = viser.ViserServer(host, port, label="a search", verbose=False)
         shown = "localhost" if host in ("127.0.0.1", "0.0.0.0") else host
         self.url = f"http://{shown}:{self._server.get_port()}"
+        begins = Ending(None, "No decision yet", "The first takes minutes where its programs have to be compiled.")
+        self._waiting = self._server.gui.add_html(card(begins))
         self._fps = fps
         self._viewer: Viewer | None = None
         self._steps: list[RecordedStep] = []
@@ -116,17 +118,18 @@ class LiveView:
         self._drawn = [*(d for d in self._drawn if not d.done() or d.exception()), drawn]
 
     def _show(self, step: SearchStep, tried: TriedActions) -> None:
-        problem = step.problem
+        problem, recorded = step.problem, recorded_step(step, tried)
+        steps = [*self._steps, recorded]
+        shown = _shown(steps, step)
+        played = planned(step, recorded.world, len(self._steps), self._time, self._fps)
+        # What is drawn takes seconds, in which a page without a step would show an arm without joints.
         if self._viewer is None:
+            self._waiting.remove()
             heading = "A search, as it runs: recognised shapes and planned motions"
             cell = problem.camera, problem.shelf
             self._viewer = Viewer(self._server, heading, *cell, self._fps, visible=_LAYERS)
             self._going.set()
             threading.Thread(target=self._viewer.run, args=(self._going.is_set,), daemon=True).start()
-        recorded = recorded_step(step, tried)
-        steps = [*self._steps, recorded]
-        shown = _shown(steps, step)
-        played = planned(step, recorded.world, len(self._steps), self._time, self._fps)
         first = self._viewer.count
         self._viewer.add([shown], played)
         self._steps, self._time = steps, float(played.time[-1]) + 1 / self._fps

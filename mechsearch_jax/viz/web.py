@@ -6,6 +6,7 @@ Viser, which sends them to the browser, is an optional dependency.
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Iterable
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -47,7 +48,13 @@ def import_viser() -> ModuleType:
         raise InputError(
             f"view needs the library viser ({error}); install it with: pip install 'mechsearch-jax[viewer]'"
         ) from error
+    # A browser opens connections ahead of need and drops them unused, which is no error of forty lines.
+    logging.getLogger("websockets.server").addFilter(_no_dropped_connection)
     return viser
+
+
+def _no_dropped_connection(record: logging.LogRecord) -> bool:
+    return not (record.exc_info and isinstance(getattr(record.exc_info[1], "__cause__", None), EOFError))
 
 
 class Mesh(NamedTuple):
