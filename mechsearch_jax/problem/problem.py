@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -64,6 +66,16 @@ class Problem(PyTreeNode):
             max_yaw=self.config.grasps.max_yaw,
             waypoints=self.config.grasps.waypoints,
         )
+
+    @functools.cached_property
+    def hand_on_edge(self) -> Problem:
+        """The same, but that the pushing hand is turned by a right angle about its approach, one finger above the other.
+
+        It is narrow then: beside a wall it has room where a level hand, 20 cm wide, has none. Only data differ, so that
+        nothing is compiled for it. Not for use inside `jit`.
+        """
+        tables = action_tables(self.gripper, self.config.grasps.wrists, self.config.actions, -math.pi / 2)
+        return self.replace(actions=tables)
 
     @property
     def target_grasps(self) -> TargetGrasps:
