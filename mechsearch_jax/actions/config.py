@@ -126,6 +126,7 @@ class ActionTables(PyTreeNode):
       still: points on the gripper at rest, shape (2, W, 3, S) [m].
       pusher: surface of the closed hand and fingers, shape (Q, 3) [m].
       turn: by how much the pushing hand is turned about its approach, as cosine and sine, shape (2,).
+      contact: see `ActionConfig.contact_tolerance`, shape () [m].
     """
 
     q7: jax.Array
@@ -135,6 +136,7 @@ class ActionTables(PyTreeNode):
     still: jax.Array
     pusher: jax.Array
     turn: jax.Array
+    contact: jax.Array
 
 
 @functools.partial(
@@ -206,5 +208,6 @@ def action_tables(
         "still": np.float32(np.swapaxes(still, -1, -2)),
         "pusher": np.float32(pusher),
         "turn": np.float32([math.cos(turn), math.sin(turn)]),
+        "contact": np.float32(config.contact_tolerance),
     }
     return ActionTables(**jax.device_put(tables))

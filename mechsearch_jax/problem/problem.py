@@ -7,6 +7,7 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
@@ -26,6 +27,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
+# `ActionTables.contact` of actions for where no other has a gain [m].
+BOLDER_CONTACT = 0.008
 # The error for a shelf in which no grasp of the target is feasible.
 NOWHERE = "shelf: the arm reaches the target nowhere; check the shelf's place before the robot"
 
@@ -68,14 +71,17 @@ class Problem(PyTreeNode):
         )
 
     @functools.cached_property
-    def hand_on_edge(self) -> Problem:
-        """The same, but that the pushing hand is turned by a right angle about its approach, one finger above the other.
+    def bolder(self) -> Problem:
+        """The same with actions for where no other has a gain. Only data differ, so that nothing is compiled for it; not
+        for use inside `jit`.
 
-        It is narrow then: beside a wall it has room where a level hand, 20 cm wide, has none. Only data differ, so that
-        nothing is compiled for it. Not for use inside `jit`.
+        The pushing hand is turned by a right angle about its approach, one finger above the other: beside a wall it has
+        room where a level hand, 20 cm wide, has none. And objects that stand against each other may be recognised as
+        overlapping deeper (`BOLDER_CONTACT`) before they lock each other in.
         """
-        tables = action_tables(self.gripper, self.config.grasps.wrists, self.config.actions, -math.pi / 2)
-        return self.replace(actions=tables)
+        config = self.config.actions
+        tables = action_tables(self.gripper, self.config.grasps.wrists, config, turn=-math.pi / 2)
+        return self.replace(actions=tables.replace(contact=jnp.float32(max(BOLDER_CONTACT, config.contact_tolerance))))
 
     @property
     def target_grasps(self) -> TargetGrasps:

@@ -524,7 +524,7 @@ class Searcher:
         """A decision and its motion, drawn anew where the arm cannot execute it.
 
         Where no gain is expected it looks one action farther ahead: what is in the way may have to be cleared first.
-        Where nothing is gained that way, or can be executed, the hand also pushes on edge (`Problem.hand_on_edge`).
+        Where nothing is gained that way, or can be executed, it tries the actions of `Problem.bolder`.
         """
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
         refused = self._now.refusals
@@ -551,9 +551,9 @@ class Searcher:
         motion, nothing = motions[-1], int(decided.decision.action.kind) == ActionKind.NONE
         if farther is not None and not last and (motion.blocked or (nothing and not unseen)):
             settings = {"last": last, "refusals": refused, "executable": executable}
-            on_edge = decide(farther, trials, key, problem.hand_on_edge, state, **settings)
+            bolder = decide(farther, trials, key, problem.bolder, state, **settings)
             if motions[-1].trajectory is not None:
-                decided, motion = on_edge, motions[-1]
+                decided, motion = bolder, motions[-1]
         return decided, self._within_limit(motion, state)
 
     @property
