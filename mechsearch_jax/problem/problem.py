@@ -72,12 +72,12 @@ class Problem(PyTreeNode):
 
     @functools.cached_property
     def bolder(self) -> Problem:
-        """The same with actions for where no other has a gain. Only data differ, so that nothing is compiled for it; not
-        for use inside `jit`.
+        """The same with actions for where no other has a gain. Not for use inside `jit`.
 
-        The pushing hand is turned by a right angle about its approach, one finger above the other: beside a wall it has
-        room where a level hand, 20 cm wide, has none. And objects that stand against each other may be recognised as
-        overlapping deeper (`BOLDER_CONTACT`) before they lock each other in.
+        Only data differ, so that nothing is compiled for it. The pushing hand is turned by a right angle about its
+        approach, one finger above the other: beside a wall it has room where a level hand, 20 cm wide, has none. And
+        objects that stand against each other may be recognised as overlapping deeper (`BOLDER_CONTACT`) before they
+        lock each other in.
         """
         config = self.config.actions
         tables = action_tables(self.gripper, self.config.grasps.wrists, config, turn=-math.pi / 2)
