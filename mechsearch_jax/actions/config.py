@@ -125,6 +125,8 @@ class ActionTables(PyTreeNode):
       low, high: bounding boxes of `clouds`, shape (2, W, 3) [m].
       still: points on the gripper at rest, shape (2, W, 3, S) [m].
       pusher: surface of the closed hand and fingers, shape (Q, 3) [m].
+      turn: by how much the pushing hand is turned about its approach, as cosine and sine, shape (2,).
+      contact: see `ActionConfig.contact_tolerance`, shape () [m].
     """
 
     q7: jax.Array
@@ -133,6 +135,8 @@ class ActionTables(PyTreeNode):
     high: jax.Array
     still: jax.Array
     pusher: jax.Array
+    turn: jax.Array
+    contact: jax.Array
 
 
 @functools.partial(
@@ -165,13 +169,17 @@ class ActionSpace:
         return self.tables.q7.shape[1]
 
 
-def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: ActionConfig) -> ActionTables:
+def action_tables(
+    gripper: Gripper, grasp_wrists: tuple[float, ...], config: ActionConfig, turn: float = 0.0
+) -> ActionTables:
     """Sample the clouds of the open and the closed gripper for every wrist.
 
     Args:
       gripper: the gripper.
       grasp_wrists: angles of joint 7 in grasps, relative to 45 degrees [rad].
       config: the actions; `push_wrists` must have as many angles.
+      turn: of the pushing hand about its approach [rad]; at 0 its fingers are side by side, at a right angle one above
+        the other, which makes it narrow.
 
     Raises:
       InputError: the numbers of angles differ.
@@ -180,7 +188,8 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
         raise InputError(
             f"{len(grasp_wrists)} wrist angles for grasps but {len(config.push_wrists)} for pushes; give as many each"
         )
-    q7 = WRIST_ORIGIN + np.array([grasp_wrists, config.push_wrists])
+    # The arm stays as it is: joint 7 alone turns the hand.
+    q7 = WRIST_ORIGIN + np.array([grasp_wrists, np.add(config.push_wrists, turn)])
     hands = list(zip((gripper.max_opening, 0.0), q7, strict=True))
     clouds = np.stack(
         [[swept_cloud(gripper, opening, float(a), config.cloud_points) for a in angles] for opening, angles in hands]
@@ -198,5 +207,7 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
         "high": np.float32(clouds.max(axis=-2)),
         "still": np.float32(np.swapaxes(still, -1, -2)),
         "pusher": np.float32(pusher),
+        "turn": np.float32([math.cos(turn), math.sin(turn)]),
+        "contact": np.float32(config.contact_tolerance),
     }
     return ActionTables(**jax.device_put(tables))

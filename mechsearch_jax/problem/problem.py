@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
@@ -24,6 +27,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
+# `ActionTables.contact` of actions for where no other has a gain [m].
+BOLDER_CONTACT = 0.008
 # The error for a shelf in which no grasp of the target is feasible.
 NOWHERE = "shelf: the arm reaches the target nowhere; check the shelf's place before the robot"
 
@@ -64,6 +69,19 @@ class Problem(PyTreeNode):
             max_yaw=self.config.grasps.max_yaw,
             waypoints=self.config.grasps.waypoints,
         )
+
+    @functools.cached_property
+    def bolder(self) -> Problem:
+        """The same with actions for where no other has a gain. Not for use inside `jit`.
+
+        Only data differ, so that nothing is compiled for it. The pushing hand is turned by a right angle about its
+        approach, one finger above the other: beside a wall it has room where a level hand, 20 cm wide, has none. And
+        objects that stand against each other may be recognised as overlapping deeper (`BOLDER_CONTACT`) before they
+        lock each other in.
+        """
+        config = self.config.actions
+        tables = action_tables(self.gripper, self.config.grasps.wrists, config, turn=-math.pi / 2)
+        return self.replace(actions=tables.replace(contact=jnp.float32(max(BOLDER_CONTACT, config.contact_tolerance))))
 
     @property
     def target_grasps(self) -> TargetGrasps:

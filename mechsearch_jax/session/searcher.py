@@ -509,6 +509,7 @@ class Searcher:
         """A decision and its motion, drawn anew where the arm cannot execute it.
 
         Where no gain is expected it looks one action farther ahead: what is in the way may have to be cleared first.
+        Where nothing is gained that way for a found target, or can be executed, it tries the actions of `Problem.bolder`.
         """
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
         refused = self._now.refusals
@@ -532,7 +533,14 @@ class Searcher:
         decided = decide(self._policy, *arguments, last=last, refusals=refused, executable=enough)
         if motions[-1].idle and farther is not None:
             decided = decide(farther, *arguments, last=last, refusals=refused, executable=executable)
-        return decided, self._within_limit(motions[-1], state)
+        motion, nothing = motions[-1], int(decided.decision.action.kind) == ActionKind.NONE
+        stuck = motion.blocked or (nothing and not unseen)
+        if farther is not None and state.belief.found and stuck and not last:
+            settings = {"last": last, "refusals": refused, "executable": executable}
+            bolder = decide(farther, trials, key, problem.bolder, state, **settings)
+            if motions[-1].trajectory is not None:
+                decided, motion = bolder, motions[-1]
+        return decided, self._within_limit(motion, state)
 
     @property
     def _motions(self) -> TrajectoryConfig:

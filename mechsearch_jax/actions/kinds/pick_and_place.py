@@ -95,11 +95,11 @@ class PickAndPlace(SampledKind):
         return near[:, None]
 
     def swept_hits(self, space: ActionSpace, scene: Superquadrics, T, mask) -> Bool[Array, "k n"]:
-        """Which objects the grasped object hits on its way out, deeper than `contact_tolerance`."""
+        """Which objects the grasped object hits on its way out, deeper than `ActionTables.contact`."""
         n, config = scene.capacity, space.config
         owner = jnp.asarray(np.repeat(np.arange(n), len(self.wrists(space))))
         held = jax.vmap(functools.partial(held_pose, scene))(owner, T)
-        clouds = object_clouds(slimmed(scene, config.contact_tolerance, 0.5), config.object_points)
+        clouds = object_clouds(slimmed(scene, space.tables.contact, 0.5), config.object_points)
         return _object_hits(T, owner, held, scene, clouds, space.gripper.approach, mask)
 
     def entering(

@@ -166,6 +166,8 @@ def object_pushes(
     starts = push_starts(config, space.wrists)
     n, v = scene.capacity, len(starts.yaw)
     rotation = gripper_rotation(jnp.asarray(starts.yaw), jnp.full(v, config.push_tilt, jnp.float32))
+    (x, y, z), (cosine, sine) = jnp.moveaxis(rotation, -1, 0), space.tables.turn
+    rotation = jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
     wide = _half_extents(scene, starts.across)
     along = _half_extents(scene, starts.heading)
     place = prints.position[:, None] + (starts.share[None] * wide)[..., None] * starts.across[None]
@@ -498,4 +500,6 @@ class Push(SampledKind):
     def describe(self, action: Action, target: int | None = None) -> str:
         d = np.asarray(action.displacement)
         what = "the target" if int(action.object) == target else f"object {int(action.object)}"
-        return f"push {what} by {100 * np.linalg.norm(d):.0f} cm {_in_words(d)}"
+        on_edge = abs(float(np.asarray(action.T_world_gripper)[2, 1])) > 0.5
+        how = ", the hand on edge" if on_edge else ""
+        return f"push {what} by {100 * np.linalg.norm(d):.0f} cm {_in_words(d)}{how}"
