@@ -207,7 +207,7 @@ def action_tables(
         "high": np.float32(clouds.max(axis=-2)),
         "still": np.float32(np.swapaxes(still, -1, -2)),
         "pusher": np.float32(pusher),
-        "turn": np.float32([math.cos(turn), math.sin(turn)]),
+        "turn": np.array([math.cos(turn), math.sin(turn)], np.float32),
         "contact": np.float32(config.contact_tolerance),
     }
     return ActionTables(**jax.device_put(tables))
