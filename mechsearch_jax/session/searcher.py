@@ -509,7 +509,8 @@ class Searcher:
         """A decision and its motion, drawn anew where the arm cannot execute it.
 
         Where no gain is expected it looks one action farther ahead: what is in the way may have to be cleared first.
-        Where nothing is gained that way for a found target, or can be executed, it tries the actions of `Problem.bolder`.
+        Where that finds nothing for a found target either, or nothing that the arm can execute, it tries the actions of
+        `Problem.bolder`.
         """
         problem, arm, motions = self.problem, self.workcell.arm, list[Motion]()
         refused = self._now.refusals
