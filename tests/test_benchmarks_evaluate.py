@@ -265,7 +265,7 @@ def test_progress_and_rates_are_shown(tmp_path, files):
         rows = evaluate(jobs, tmp_path / "rows", one_by_one, ended=progress.ended)
     console.print(summary_table(summarise(rows), Key.of(rows)))
     text = screen.getvalue()
-    assert "3/3 raise: error: ValueError: no" in text
+    assert "3/3 raise: the program failed after 0 actions: ValueError: no" in text
     everything = next(line for line in text.splitlines() if " all " in line)
     assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.00"]
 

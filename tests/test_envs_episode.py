@@ -39,12 +39,13 @@ from mechsearch_jax.envs.camera.snapshot import (
     truth_unseen,
 )
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
+from mechsearch_jax.envs.episode.endings import events, verdict
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.numbering import named_observation
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
 from mechsearch_jax.envs.episode.slots import sizes_and_truths
-from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
+from mechsearch_jax.envs.recording.narration import Narrator
 from mechsearch_jax.envs.recording.pictures import frame
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
@@ -286,11 +287,11 @@ def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
     assert f"cost {episode.steps[0].cost:.0f} now" in first
     assert "the target at x" in narrated
     assert "a grasp that takes it out is known" in narrated
-    assert "failed  retrieval: missed" in narrated
+    assert "failed  the hand missed the target" in narrated
     assert narrated.strip().endswith(verdict(episode))
     assert len(narrator.frames) == len(episode.steps)
     assert [frame.found for frame in narrator.frames] == [False, True, True]
-    assert "retrieval: missed" in narrator.frames[1].caption
+    assert "the hand missed the target" in narrator.frames[1].caption
 
 
 def test_a_policy_that_compares_no_costs_is_not_said_to(problem):
@@ -389,11 +390,10 @@ def test_what_never_comes_to_rest_is_recorded_and_is_no_error(problem):
     episode = run(problem, HIDDEN, Stage(reveal, restless=True))
     assert episode.retrieved
     assert [step.at_rest for step in episode.steps] == [False, False]
-    said = [f"something moved on and never came to rest after action {i}" for i in (1, 2)]
-    assert verdict(episode).endswith(", ".join(["retrieved", *said]))
-    assert events(episode.steps[0]) == ["something moved on, never came to rest, and was stopped"]
+    assert verdict(episode).endswith(": the target is out after 2 actions; something still moves")
+    assert events(episode.steps[0]) == ["something still moves"]
     calm = run(problem, HIDDEN, Stage(push_off))
-    assert "rest" not in verdict(calm)
+    assert ";" not in verdict(calm)
     assert events(calm.steps[0]) == ["object 0 fell off the board: nothing can be retrieved any more"]
     assert events(calm.steps[1]) == []
 

@@ -141,7 +141,7 @@ def test_the_page_shows_what_was_recognised_and_what_is_planned(problem, view):
     searcher.next(IMAGES.depth, IMAGES.colour)
     searcher.acted()
     view.wait()
-    assert "Retrieved" in view.viewer.ended
+    assert "the target is out after 2 actions" in view.viewer.ended
     assert view.viewer.step_at(view.viewer.count - 1) == 1
 
 

@@ -122,7 +122,7 @@ def test_a_page_shows_the_values_of_the_recording(text):
     assert (last.hits, last.blocked) == (("object 0",), (0,))
     assert "0 of 2 grasps within the arm’s reach meet nothing; all hit object 0" in words
     assert (last.candidates, last.cost, last.outcome) == ((), None, "")
-    assert "Lost: found, but not graspable" in words
+    assert "the target was found, but is not out after 1 action: no grasp of it is free" in words
     assert "actions 1 of at most 1" in words
 
 
@@ -152,7 +152,7 @@ def test_what_the_belief_and_the_action_are_wrong_about_is_a_warning():
     assert of(blind=True).warnings == ("the action sweeps space of which nothing was measured",)
     assert of(held_up=True, fallen=(2,)).warnings[0] == "the arm was held up"
     assert of(held_up=True, fallen=(2,)).warnings[1].startswith("object 2 fell off the board")
-    assert of(failure="unreachable").outcome == "the arm cannot follow it"
+    assert of(failure="unreachable").outcome == "the arm cannot follow the motion"
     doubtful = dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, steps=(record(PUSH, blind=True),) * 2))
     assert "Warning: the action sweeps space" in Parsed(page(doubtful)).words
     mistaken = dataclasses.replace(STEPS[0], evidence=evidence(found=True))
@@ -193,10 +193,14 @@ def test_endings_are_those_of_the_record():
     def of(**changes):
         return ending(dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, **changes)))
 
-    assert of() == (False, "Lost: found, but not graspable", "found after 1 action")
-    assert of(failure="retrieval: missed").title == "Lost: the hand missed the target"
-    assert of(retrieved=True, failure=None)[:2] == (True, "Retrieved")
-    assert ending(RECORDING) == (None, "retrieved", "")
+    leans = record(PUSH, at_rest=False, restless=("object 0 leans on the back wall",))
+    lost = "the target was found, but is not out after 1 action"
+    assert of()[:2] == (False, f"{lost}: no grasp of it is free")
+    assert of(failure="retrieval: missed").title == f"{lost}: the hand missed the target"
+    assert of(found_step=None, failure="not found").title == "the target was not found after 1 action"
+    out = of(retrieved=True, failure=None, steps=(record(PUSH, at_rest=False), leans))
+    assert out[:2] == (True, "the target is out after 2 actions; object 0 leans on the back wall")
+    assert ending(RECORDING)[:2] == (None, "retrieved")
 
 
 def test_a_policy_that_minds_no_cost_is_shown_none():
@@ -270,7 +274,7 @@ def test_the_last_state_is_that_after_the_last_action():
 def test_the_command_writes_the_page(tmp_path, capsys):
     save_recording(LOST, tmp_path / NAME)
     cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "pages" / "page.html")])()
-    assert "Lost: found, but not graspable" in (tmp_path / "pages" / "page.html").read_text(encoding="utf-8")
+    assert "no grasp of it is free" in (tmp_path / "pages" / "page.html").read_text(encoding="utf-8")
     assert "page.html" in capsys.readouterr().out
 
 

@@ -155,7 +155,7 @@ def test_a_panel_shows_the_values_and_what_blocks_the_target(another_server):
 
     server = another_server
     lost = Viewer.of(LOST, server, FPS)
-    assert "Lost: found, but not graspable" in lost.ended
+    assert "the target was found, but is not out after 1 action" in lost.ended
     lost.show(0)
     assert "100.0 before, 60.0 predicted, 95.0 measured" in lost.text
     assert "next best" in lost.evidence

@@ -9,6 +9,7 @@ from rich.table import Table
 from mechsearch_jax.benchmarks.parts.bench import Timing
 from mechsearch_jax.benchmarks.running.evaluate import Tally
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
+from mechsearch_jax.envs.episode.endings import ending_words
 from mechsearch_jax.envs.scenes import scene_sets
 
 
@@ -107,10 +108,9 @@ class EpisodeProgress:
         errors = f"  errors {tally.errors}" if tally.errors else ""
         self._bar.update(self._task, completed=tally.ended, total=tally.wanted, description=rates + errors)
         if not self._console.is_terminal:
-            outcome = "retrieved" if row.retrieved else row.failure
-            count = f"{tally.ended}/{tally.wanted}"
+            how = ending_words(row.found_step is not None, row.retrieved, row.failure, row.steps)
             self._console.print(
-                f"{count} {row.scenario}: {outcome}, {row.steps} actions  ({rates}{errors})",
+                f"{tally.ended}/{tally.wanted} {row.scenario}: {how}  ({rates}{errors})",
                 soft_wrap=True,
                 markup=False,
             )

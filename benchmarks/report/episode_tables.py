@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.actions_until import RestrictedMeans, horizon_of
 from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise
-from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
+from mechsearch_jax.benchmarks.statistics.variants import LONGEST, MOST_IN_FULL, VARIANT, Key
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 
 
@@ -43,9 +43,9 @@ def summary_table(summary: Sequence[Rates], key: Key) -> Table:
     """
     table = plain_table()
     for name in summary[0].group:
-        _add_group_column(table, name)
+        _add_group_column(table, name, key)
     for name in ("runs", "found", "graspable", "paper's", "retrieved", "actions", "plan", "act"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right", overflow="fold")
     for rates in _shown(summary, key):
         shares = rates.found, rates.graspable, rates.paper_graspable, rates.retrieved
         table.add_row(
@@ -60,11 +60,12 @@ def summary_table(summary: Sequence[Rates], key: Key) -> Table:
     return table
 
 
-def _add_group_column(table: Table, name: str) -> None:
-    """A column that says what a group has in common; others give way before labels do."""
+def _add_group_column(table: Table, name: str, key: Key) -> None:
+    """A column that says what a group has in common; other columns are folded before short labels of variants are."""
     text = name in (VARIANT, "scenario", "policy")
     header = {"objects": "objs"}.get(name, name.replace("_", " "))
-    table.add_column(header, justify="left" if text else "right", no_wrap=name == VARIANT, overflow="fold")
+    whole = name == VARIANT and max(map(len, key.short.values())) <= LONGEST
+    table.add_column(header, justify="left" if text else "right", no_wrap=whole, overflow="fold")
 
 
 def _group(group: Mapping[str, Hashable], key: Key) -> list[str]:
@@ -84,9 +85,9 @@ def restricted_table(means: Sequence[RestrictedMeans], key: Key) -> Table:
     budget, retrieval = (horizon_of(goal, means[0].budget) for goal in ("found", "retrieved"))
     table = plain_table(f"actions until then, never counted as {budget}, or {retrieval} for retrieved")
     for name in means[0].group:
-        _add_group_column(table, name)
+        _add_group_column(table, name, key)
     for name in ("runs", *GOALS):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right", overflow="fold")
     for group in _shown(means, key):
         values = [getattr(group, goal) for goal in GOALS]
         table.add_row(
@@ -103,7 +104,7 @@ def differences_table(differences: VariantDifferences, key: Key, baseline: str) 
     table = plain_table(f"points more than {key.short[baseline]}, same episodes")
     table.add_column("variant", overflow="fold")
     for name in ("pairs", *GOALS):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right", overflow="fold")
     for label, goals in differences.items():
         cells = []
         for goal in GOALS:
@@ -118,9 +119,9 @@ def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
     """What happened on the way, of at least one group."""
     table = plain_table()
     for name in summary[0].group:
-        _add_group_column(table, name)
+        _add_group_column(table, name, key)
     for name in ("runs", *EVENTS.values()):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for events in _shown(summary, key):
         table.add_row(
             *_group(events.group, key),
@@ -136,7 +137,7 @@ def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
     pairs = comparisons[0].pairs
     table = plain_table(f"{pairs} episodes against {code}")
     for name in ("", "before", "now", "gains", "losses", "p", "verdict"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right", overflow="fold")
     for comparison in comparisons:
         verdict = "lost" if comparison.lost else "no significant loss"
         counts = (comparison.before, comparison.now, comparison.gains, comparison.losses)

@@ -12,6 +12,7 @@ from typing import Any
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.variants import label_variants
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, episode_key, options_of
+from mechsearch_jax.envs.episode.endings import ending_words, verdict
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.workspace.scenario import Scenario
@@ -99,8 +100,8 @@ def _seconds(row: EpisodeRow) -> float:
 
 
 def _caption(row: EpisodeRow) -> str:
-    ended = "retrieved" if row.retrieved else row.failure or "not retrieved"
-    return f"{row.scenario}: {ended}, {row.steps} actions, {_seconds(row):.1f} s"
+    how = ending_words(row.found_step is not None, row.retrieved, row.failure, row.steps)
+    return f"{row.scenario}: {how} ({_seconds(row):.1f} s)"
 
 
 Draw = Callable[[EpisodeRow, Path], str]
@@ -172,7 +173,6 @@ def replay(row: EpisodeRow, scenario: Scenario, file: PathLike) -> str:
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.page.page import save_page
-    from mechsearch_jax.envs.recording.narration import verdict
     from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
     from mechsearch_jax.envs.simulators.native import NativeSimulator
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig

@@ -13,7 +13,7 @@ from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 ENDS: Mapping[str, str] = {
     "retrieved": "retrieved",
     "graspable": "graspable, but not retrieved",
-    "found": "found, but never graspable without touching something",
+    "found": "found, but no grasp of it was ever free",
     "hidden": "never found",
     "error": "an error of the program",
 }

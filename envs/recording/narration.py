@@ -10,8 +10,9 @@ from rich.markup import escape
 from rich.status import Status
 
 from mechsearch_jax.actions import ActionKind, kind_of
+from mechsearch_jax.envs.episode.endings import events, in_words, verdict
 from mechsearch_jax.envs.episode.moments import Moment
-from mechsearch_jax.envs.episode.records import Episode, Step
+from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.recording import pictures
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.filmstrip import Frame
@@ -81,7 +82,7 @@ class Narrator:
         if record.action is None:
             self._sees(moment)
         if record.failure:
-            self._line("failed", record.failure, "red")
+            self._line("failed", in_words(record.failure), "red")
         for event in events(record):
             self._line("but", event, "red")
         stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in record.timings.items())
@@ -116,49 +117,3 @@ class Narrator:
 
     def _line(self, label: str, text: str, style: str = "") -> None:
         self._console.print(f"  [cyan]{label:>6}[/cyan]  [{style or 'default'}]{escape(text)}[/]", soft_wrap=True)
-
-
-def events(record: Step) -> list[str]:
-    """Unintended events of a step, beside its `failure`."""
-    messages = []
-    if record.fallen:
-        several = len(record.fallen) > 1
-        which = " and ".join(map(str, record.fallen))
-        messages.append(f"object{'s' if several else ''} {which} fell off the board: nothing can be retrieved any more")
-    if record.target_fallen:
-        messages.append("the target fell off the board")
-    if record.at_rest is False:
-        messages.append(f"{_what_moves(record)}, never came to rest, and was stopped")
-    return messages
-
-
-def _what_moves(record: Step) -> str:
-    """What did not come to rest, and where it is."""
-    return " and ".join(record.restless or ()) or "something moved on"
-
-
-def verdict(episode: Episode) -> str:
-    """How an episode ended, in one sentence."""
-
-    def after(step: int) -> str:
-        return f"after {step} action{'' if step == 1 else 's'}"
-
-    parts = []
-    if episode.found_step is None:
-        parts.append(f"not found ({episode.failure})")
-    else:
-        graspable, by_paper = episode.graspable_step, episode.paper_graspable_step
-        parts.append(f"found {after(episode.found_step)}")
-        never = "never graspable without touching something"
-        parts.append(never if graspable is None else f"graspable {after(graspable)}")
-        if graspable != by_paper:
-            when = "never" if by_paper is None else after(by_paper)
-            recorded = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)
-            parts[-1] += f" ({when} with the paper's grasps)" if recorded else ""
-        parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
-    parts += [
-        f"{_what_moves(step)} and never came to rest after action {i + 1}"
-        for i, step in enumerate(episode.steps)
-        if step.at_rest is False
-    ]
-    return f"{episode.scenario}: {', '.join(parts)}"

@@ -13,6 +13,7 @@ from mechsearch_jax.actions import kind_of
 from mechsearch_jax.actions.kind import Sketch
 from mechsearch_jax.envs.camera.simulated_camera import Image
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle, true_target_pose, truth_of
+from mechsearch_jax.envs.episode.endings import in_words
 from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.episode.numbering import named_objects
 from mechsearch_jax.envs.recording.recording import RecordedStep
@@ -47,7 +48,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
     believed = bool(belief.found)
     mistaken = "something else is taken for the target" if believed else f"target can be at {record.belief_size} poses"
     target = "target found" if record.found else mistaken
-    outcome = f" · {record.failure}" if record.failure else ""
+    outcome = f" · {in_words(record.failure)}" if record.failure else ""
     outcome += " · an object fell off the board" if record.fallen else ""
     nowhere = np.zeros(problem.poses.shape[0], bool)
     return Frame(

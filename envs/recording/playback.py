@@ -21,8 +21,10 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
 
-# How long the robot is shown at home before an action, and everything at the end [s].
-LOOKS, ENDS = 1.2, 1.5
+# How long the robot is shown at home before an action, and everything once the hand has stopped for the last time [s].
+LOOKS, ENDS = 1.2, 0.5
+# A hand whose joints and fingers are slower than this has stopped [rad/s, m/s].
+STOPPED = 0.01
 # A joint that turns by more than this between rows was set, not moved [rad].
 SET = 0.2
 # Ways in front of the shelf: time step [s], share of the joints' limits, and duration if planning fails [s].
@@ -66,7 +68,7 @@ class _Piece(NamedTuple):
 
 
 def playback(recording: Recording, fps: int, speed: float = 1.0) -> Playback:
-    """A recording as evenly spaced moments.
+    """A recording as evenly spaced moments; what still moves when the hand has stopped for good is left out.
 
     Args:
       recording: of the episode.
@@ -84,8 +86,12 @@ def playback(recording: Recording, fps: int, speed: float = 1.0) -> Playback:
     for (i, piece), begin, end in zip(pieces, starts[:-1], starts[1:], strict=True):
         inside = moments[(moments >= begin) & (moments < end)]
         columns.append((np.full(len(inside), i), inside, *_sampled(piece, inside - begin)))
-    step, time, *rest = (np.concatenate(parts) for parts in zip(*columns, strict=True))
-    return Playback(step, time, *rest)
+    step, time, q, opening, *bodies = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    # The first row counts as a motion, so that there always is a last one.
+    speed_of_hand = np.abs(np.diff(np.column_stack([q, opening]), axis=0, prepend=0.0)).max(axis=1) * fps / speed
+    stops, looks = time[np.flatnonzero(speed_of_hand > STOPPED)[-1]], time[step == step[-1]][0]
+    shown = time <= max(stops + ENDS, looks + LOOKS)
+    return Playback(*(column[shown] for column in (step, time, q, opening, *bodies)))
 
 
 def _pieces(step: RecordedStep, shelf: Shelf) -> Iterator[_Piece]:

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
+from mechsearch_jax.envs.episode.endings import events, in_words, verdict
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.episode.records import Step
 from mechsearch_jax.envs.known_target.in_the_way import blocking, least_sets, objects_in_words
-from mechsearch_jax.envs.recording.narration import events
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.observation import Observation
@@ -39,28 +39,20 @@ SEEING = ("masks", "masks-parts", "full", "full-parts")
 FEWEST_PIXELS = 100
 # What moved less at an action counts as where it was [m], and what tilted less as upright [rad].
 DISPLACED, TILTED = 0.01, np.deg2rad(20.0)
-# Failures that a record has as a single word.
-_FAILURES = {
-    "missed": "the hand missed the target",
-    "inside": "the target did not leave the shelf",
-    "unreachable": "the arm cannot follow it",
-    "dropped": "the object slipped out of the hand",
-    "unstable": "the simulation diverged",
-}
 
 
 class Ending(NamedTuple):
-    """How an episode ended.
+    """How an episode ended, or where it is.
 
     Attributes:
       good: whether it reached what its protocol asks for; None if nothing says so.
-      title: in a few words.
-      text: in a sentence.
+      title: in a sentence.
+      text: what more is to be said.
     """
 
     good: bool | None
     title: str
-    text: str
+    text: str = ""
 
 
 class Candidate(NamedTuple):
@@ -173,12 +165,10 @@ def environment(*folders: Path) -> jinja2.Environment:
 
 def ending(recording: Recording) -> Ending:
     """How a recording's episode ended."""
-    episode, how = recording.episode, recording.heading.partition(": ")[2] or recording.heading
+    episode = recording.episode
     if episode is None:
-        return Ending(None, how, "")
-    if episode.retrieved:
-        return Ending(True, "Retrieved", how)
-    return Ending(False, f"Lost: {_plain(episode.failure or 'not retrieved')}", how)
+        return Ending(None, recording.heading.partition(": ")[2] or recording.heading)
+    return Ending(episode.retrieved, verdict(episode).removeprefix(f"{episode.scenario}: "))
 
 
 def step_values(recording: Recording, i: int) -> StepValues:
@@ -252,12 +242,6 @@ def confidence(step: RecordedStep) -> Float[np.ndarray, " n"]:
 def recognised_shapes(step: RecordedStep) -> tuple[Shape, ...]:
     """The recognised objects of a step whose true ones nobody knows."""
     return tuple(_shape(step, i, None) for i in range(step.scene.capacity) if step.scene.valid[i])
-
-
-def _plain(failure: str) -> str:
-    """A failure in plain words."""
-    reason = failure.removeprefix("retrieval: ")
-    return _FAILURES.get(reason, reason)
 
 
 def _in_words(action: Action, step: RecordedStep) -> str:
@@ -377,7 +361,7 @@ def _outcome(recording: Recording, i: int, record: Step | None) -> str:
     if record is None or step.action is None:
         return ""
     if record.failure:
-        return _plain(record.failure)
+        return in_words(record.failure)
     took = last and recording.episode is not None and recording.episode.retrieved
     came = not last and recording.steps[i + 1].found and not step.found
     return "the target was taken out" if took else "carried out" + (", and the target came into view" if came else "")

@@ -21,6 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import jax
 import numpy as np
 
+from mechsearch_jax.envs.episode.endings import ending_words
 from mechsearch_jax.envs.recording.body_solids import body_solids, moved
 from mechsearch_jax.envs.recording.evidence import evidence_without_truth
 from mechsearch_jax.envs.recording.playback import Playback
@@ -143,7 +144,7 @@ class LiveView:
         if not ok:
             how = Ending(None, "Broken off", f"The motion did not come to its end: {step.reason}")
         elif step.kind == "retrieve":
-            how = Ending(True, "Retrieved", f"The target was taken out by action {step.index + 1}.")
+            how = Ending(True, ending_words(True, True, None, step.index + 1))
         else:
             how = Ending(None, f"Action {step.index + 1} is over", step.reason)
         self._viewer.end(how)

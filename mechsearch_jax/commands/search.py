@@ -100,8 +100,8 @@ class OutputFiles:
 
 def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrator: Narrator) -> None:
     """Write the filmstrip, the scenario and the episode."""
+    from mechsearch_jax.envs.episode.endings import verdict
     from mechsearch_jax.envs.episode.records import save_episode
-    from mechsearch_jax.envs.recording.narration import verdict
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.filmstrip import filmstrip
     from mechsearch_jax.workspace.scenario import save_scenario
@@ -218,7 +218,7 @@ def search(
             problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.config.problem)
             episode, narrator, recorder = _run(status, preparing, chosen, scene, problem, seed, keeps.records)
         # Imported late: they take long.
-        from mechsearch_jax.envs.recording.narration import verdict
+        from mechsearch_jax.envs.episode.endings import verdict
         from mechsearch_jax.envs.recording.recording import NAME, save_recording
 
         status.update("writing")
