@@ -119,6 +119,17 @@ KNOWN = {
 }
 
 
+@pytest.mark.parametrize("table", [summary_table, events_summary_table])
+def test_a_narrow_screen_drops_no_column(table):
+    rows = [dataclasses.replace(WON, **KNOWN), dataclasses.replace(LOST, objects=8, **KNOWN)]
+    summary = summarise(rows) if table is summary_table else summarise_events(rows)
+    screen = Console(file=io.StringIO(), width=80)
+    screen.print(table(summary, Key({"search-for-grasp": "standard, full-parts, size spread 1.05"})))
+    text = screen.file.getvalue()
+    lines = [line.split()[1:3] for line in text.splitlines() if line.startswith("standard")]
+    assert (lines, "…" in text) == ([["2", "1"], ["8", "1"], ["all", "2"]], False)
+
+
 def test_a_report_says_what_happened_on_the_way(tmp_path):
     """Of three episodes one does not say it; the others had eight looks together."""
     fell = "an object fell off the board"

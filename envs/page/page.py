@@ -12,6 +12,7 @@ from typing import Any
 
 from PIL import Image
 
+from mechsearch_jax.envs.episode import endings
 from mechsearch_jax.envs.recording import step_pictures, step_values
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import Recording
@@ -22,7 +23,8 @@ from mechsearch_jax.viz import drawing
 _TEMPLATE = Path(__file__).with_name("page.html.jinja")
 _VALUES, _PICTURES = Path(step_values.__file__), Path(step_pictures.__file__)
 # What decides how a page reads and looks.
-_SOURCES = (Path(__file__), _TEMPLATE, _VALUES, _VALUES.with_name("step_values.html.jinja"), _PICTURES)
+_VALUES_TEMPLATE, _WORDS = _VALUES.with_name("step_values.html.jinja"), Path(endings.__file__)
+_SOURCES = (Path(__file__), _TEMPLATE, _VALUES, _VALUES_TEMPLATE, _WORDS, _PICTURES)
 # Of WebP.
 QUALITY = 75
 # Options of an episode that its card names.
