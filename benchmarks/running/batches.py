@@ -98,7 +98,7 @@ class Batches:
         jobs: Sequence[Job],
         begin: Callable[[Job], bool],
         failures: _Failures,
-        trying: Callable[[str, float], Trials | None],
+        trying: Callable[[str], Trials | None],
     ) -> None:
         # What is compiled for one group serves the next.
         simulators: dict[tuple[EngineName, Workcell], Simulator] = {}
