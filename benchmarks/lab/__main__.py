@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.lab import PROGRAM
-from mechsearch_jax.benchmarks.lab.commands import episodes, looks, quality
+from mechsearch_jax.benchmarks.lab.commands import episodes, quality
 from mechsearch_jax.benchmarks.lab.commands.study import study
 from mechsearch_jax.commands.main import Commands, call_of, run
 
 COMMANDS: Commands = {
     "study": study,
     **quality.COMMANDS,
-    **looks.COMMANDS,
     **episodes.COMMANDS,
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Group
 from rich.markup import escape
@@ -15,79 +15,6 @@ from mechsearch_jax.benchmarks.lab.parts import push, scenes, segmentation
 from mechsearch_jax.benchmarks.lab.parts.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.lab.parts.recognition import SHARES, MeasuredRecognition
 from mechsearch_jax.benchmarks.report.console_tables import plain_table
-from mechsearch_jax.benchmarks.statistics.intervals import with_interval
-
-if TYPE_CHECKING:
-    from mechsearch_jax.benchmarks.lab.looks import bodies, looks
-
-
-def looks_tables(measured: looks.MeasuredLooks) -> Group:
-    """What comes of depth and colour images alone, for all segments and noises: by pixels, contact and number of
-    objects, and how often objects are wrong by their stated confidence."""
-    tables: list[Table] = []
-    for line in measured.summary():
-        if "looks" in line:
-            title = (
-                f"{line['segments']}, {line['noise']}: {line['looks']} looks, {line['phantoms']} phantoms; targets: "
-                f"{line['targets_in_sight']} in sight, {line['targets_missed']} missed, {line['targets_false']} false"
-            )
-            tables.append(plain_table(title))
-            for name in ("objects", "counted", "wrong", "missing", "off", "turned", "IoU", "kinds"):
-                tables[-1].add_column(name, justify="left" if name in ("objects", "kinds") else "right")
-        numbers = [str(line[name]) for name in ("objects", "wrong", "missing", "off", "turned")]
-        kinds = ", ".join(f"{count} {kind}" for kind, count in line["kinds"].items())
-        tables[-1].add_row(line["group"], *numbers, f"{line['iou_mean']:.3f}", kinds)
-    stated = plain_table("stated confidence")
-    for name in ("segments", "noise", "confidence", "recognised", "wrong", "expected"):
-        stated.add_column(name, justify="left" if name in ("segments", "noise") else "right")
-    for line in measured.reliability():
-        within = f"{line['from']:.2f} to {line['to']:.2f}"
-        counts = (str(line["objects"]), str(line["wrong"]), f"{line['expected_wrong']:.1f}")
-        stated.add_row(line["segments"], line["noise"], within, *counts)
-    value = measured.value()
-    times = ", ".join(
-        f"{kind}: {1e3 * value['seconds'][kind]['median']:.0f} ms a look (95th percentile "
-        f"{1e3 * value['seconds'][kind]['95th percentile']:.0f}), compiled in {value['compile_seconds'][kind]:.0f} s"
-        for kind in value["seconds"]
-    )
-    explanation = (
-        "Visible objects of at least 100 pixels. off: more than 2 cm; turned: more than 15 degrees. Kinds: by the "
-        f"segments. {times}; {measured.versions['device']}."
-    )
-    return Group(*tables, stated, Text(explanation, style="dim"))
-
-
-COLUMNS = ("objects", "IoU", "collisions right", "wrongly hit", "wrongly clear", "parts")
-
-
-def bodies_tables(measured: bodies.MeasuredBodies) -> Group:
-    """How well recognised bodies describe the true ones, by description and by thing."""
-    whole = _table("95% intervals resample scenes", "described by", "of")
-    for line in measured.summary():
-        whole.add_row(line["description"], line["group"], *_cells(line, intervals=True))
-    things = _table("things, those that are mostly seen", "thing", "described by")
-    for line in measured.things():
-        things.add_row(line["thing"], line["description"], *_cells(line, intervals=False))
-    seconds = measured.value()["seconds"]
-    times = ", ".join(f"{name}: {1e3 * spent:.0f} ms a look" for name, spent in seconds.items())
-    explanation = (
-        f"mostly seen: {100 * measured.settings['mostly']:.0f}% of the pixels that it would show alone. Collisions: of "
-        f"the open gripper's cloud at random poses near the object. {times}; {measured.versions['device']}."
-    )
-    return Group(whole, things, Text(explanation, style="dim"))
-
-
-def _table(title: str, *first: str) -> Table:
-    table = plain_table(title)
-    for name in (*first, *COLUMNS):
-        table.add_column(name, justify="left" if name in first else "right")
-    return table
-
-
-def _cells(line: Mapping[str, Any], intervals: bool) -> list[str]:
-    means = [with_interval(line[name], line[f"{name}_interval"] if intervals else None) for name in ("iou", "right")]
-    shares = (f"{line[name]:.4f}" for name in ("false_hits", "missed_hits"))
-    return [str(line["objects"]), *means, *shares, f"{line['parts']:.2f}"]
 
 
 def sensors_table(columns: Mapping[str, Mapping[str, float]]) -> Table:

@@ -342,10 +342,39 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     console.print(scenes_table(rows))
 
 
+def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = None) -> None:
+    """Measure what the depth images of simulated sensors are like, and beside them real ones.
+
+    Args:
+      scenes: images of each sensor and view.
+      real: folder of folders of labelled images; each is a column.
+      out: JSON file for the figures.
+
+    Raises:
+      InputError: there are no images in the folder, or the file cannot be written.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.lab.parts import sensors
+    from mechsearch_jax.benchmarks.lab.tables import sensors_table
+    from mechsearch_jax.runtime.files import save_json
+
+    check_files(out)
+    at_least_one("lab sensors", scenes=scenes)
+    console = Console(highlight=False)
+    with console.status("measuring"):
+        columns = {} if real is None else sensors.real_columns(real)
+        columns |= sensors.simulated_columns(scenes)
+        if out is not None:
+            save_json(columns, out)
+    console.print(sensors_table(columns))
+
+
 COMMANDS = {
     "scenes": bench_scenes,
     "agreement": bench_agreement,
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,
     "push": bench_push,
+    "sensors": bench_sensors,
 }
