@@ -207,12 +207,7 @@ WRONG = {
     "no images": (["bench", "perceive", "--batch", "0"], "--batch 0 must be at least 1"),
     "nothing to segment": (["lab", "segmentation", "--scenes", "0"], "there are no scenes"),
     "no picture of segments": (["lab", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
-    "no picture": (["lab", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
     "the same scene twice": (["lab", "recognition", "good.json", "good.json"], "two scenes are called one-box"),
-    "picture of nothing": (
-        ["lab", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
-        "--worst-of network-refined is not among the methods",
-    ),
     "file in a file": (["lab", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
     "no pushes": (["lab", "push", "--pushes", "0"], "lab push: --pushes 0 must be at least 1"),
     "unknown seed of pushes": (["lab", "push", "--seed", "-1"], "lab push: --seed -1 must be from 0"),

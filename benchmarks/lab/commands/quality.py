@@ -88,21 +88,6 @@ def bench_agreement(
 
 
 @dataclasses.dataclass(frozen=True)
-class WorstPicture:
-    """A picture of the worst answers.
-
-    Attributes:
-      picture: PNG file for the worst answers of a method, beside the truth.
-      worst: how many of them.
-      worst_of: which method's.
-    """
-
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    worst: int = 12
-    worst_of: Recogniser = "network-refined"
-
-
-@dataclasses.dataclass(frozen=True)
 class GeneratedScenes:
     """Scenes that are made.
 
@@ -127,7 +112,6 @@ def bench_recognition(
     method: tuple[Recogniser, ...] = get_args(Recogniser),
     ems_scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     out: JsonFile = None,
-    drawn: Annotated[WorstPicture, tyro.conf.arg(name="")] = WorstPicture(),
 ) -> None:
     """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
 
@@ -138,16 +122,13 @@ def bench_recognition(
       method: one or more; one that begins with another's answers brings it along.
       ems_scenes: number of scenes, spread evenly over all, for EMS, which is slow; all if not given.
       out: JSON file for the figures and for every object's row.
-      drawn: what is drawn.
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure
+    from mechsearch_jax.benchmarks.lab.parts import images, recognition
     from mechsearch_jax.benchmarks.lab.tables import recognition_tables, recognition_times_table
-    from mechsearch_jax.viz.drawing import save_figure
 
-    at_least_one("lab recognition", worst=drawn.worst)
-    check_files(out, drawn.picture)
+    check_files(out)
     places = _places("lab recognition", generated.config, scenarios)
     given = images.scenes_of(_loaded(scenarios))
     console = Console(highlight=False)
@@ -164,15 +145,7 @@ def bench_recognition(
             )
             for name, place in places.items()
         }
-        if drawn.picture is not None and any(drawn.worst_of not in bench.methods for bench in benches.values()):
-            raise InputError(
-                f"lab recognition: --worst-of {drawn.worst_of} is not among the methods; add it to --method"
-            )
         measured = _measured(benches, places, status, out)
-        if drawn.picture is not None:
-            status.update("drawing")
-            rows = recognition_figure.worst(measured.rows, drawn.worst_of, drawn.worst)
-            save_figure(recognition_figure.worst_figure(list(benches.values()), rows), drawn.picture)
     console.print(recognition_tables(measured))
     if measured.times:
         console.print(recognition_times_table(measured))
