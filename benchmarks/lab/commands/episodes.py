@@ -40,12 +40,6 @@ def _scenes(command: str, names: Sequence[str]) -> list[Scenario]:
     return scenes
 
 
-def _nearest(best: Node) -> str:
-    """How near to being solved the best world of a search is."""
-    hit = "no grasp" if best.judgement.least is None else f"{best.judgement.least} in the way"
-    return f"{hit} after {len(best.actions)} actions"
-
-
 @dataclasses.dataclass(frozen=True)
 class KnownSearch:
     """How much is tried in the search of a scene.
@@ -81,8 +75,8 @@ def bench_ceiling(
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
-      out: folder for a file for every scene that is searched, a picture of each that stays unsolved, and ceiling.json.
-        Scenes that have a file of the same code and options are not searched again.
+      out: folder for a file for every scene that is searched, and ceiling.json. Scenes that have a file of the same
+        code and options are not searched again.
       results: of `evaluate` (folders, .parquet) and stored ones (.json); what was retrieved in any is solvable.
       effort: how much is tried.
     """
@@ -108,7 +102,7 @@ def bench_ceiling(
         for scene in scenes:
 
             def on_round(number: int, best: Node, scene=scene) -> None:
-                line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {_nearest(best)}"
+                line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {solvability.nearest(best)}"
                 status.update(line)
                 if not console.is_terminal:
                     console.print(line, soft_wrap=True)
