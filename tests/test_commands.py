@@ -268,7 +268,7 @@ def test_what_a_checkout_alone_has_is_refused_with_the_way_there():
 
 def test_the_lab_is_a_program_of_a_checkout(folder):
     answer = subprocess.run(
-        [sys.executable, "-m", "mechsearch_jax.benchmarks.lab", "looks", "none.json"],
+        [sys.executable, "-m", "mechsearch_jax.benchmarks.lab", "scenes", "none.json"],
         cwd=Path(__file__).parents[1], capture_output=True, text=True,
     )  # fmt: skip
     assert answer.returncode == 2

@@ -78,11 +78,8 @@ IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
     "mechsearch": ("study",),
     "mechsearch bench": (
         "agreement",
-        "bodies",
         "ceiling",
         "cell",
-        "confidence",
-        "looks",
         "push",
         "recognition",
         "scenes",
