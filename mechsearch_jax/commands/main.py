@@ -73,20 +73,8 @@ GROUPS: Mapping[str, Commands] = {
     "train": train.COMMANDS,
     "bench": bench.COMMANDS,
 }
-# What only a checkout has: benchmarks/lab.
-IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
-    "mechsearch": ("study",),
-    "mechsearch bench": (
-        "agreement",
-        "ceiling",
-        "cell",
-        "push",
-        "recognition",
-        "scenes",
-        "segmentation",
-        "sensors",
-    ),
-}
+# What only a checkout has: benchmarks/lab, once commands of `mechsearch bench`.
+IN_A_CHECKOUT = ("agreement", "ceiling", "cell", "push", "recognition", "scenes", "segmentation", "sensors")
 
 
 # Complete option types, which take a second to make, by the type in a command's signature.
@@ -155,7 +143,7 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     commands = GROUPS[group] if group else COMMANDS
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
     rest = list(arguments[1:] if group else arguments)
-    if rest and rest[0] in IN_A_CHECKOUT.get(program, ()):
+    if program == "mechsearch bench" and rest and rest[0] in IN_A_CHECKOUT:
         raise InputError(
             f"{program} {rest[0]} needs a checkout: run `python -m mechsearch_jax.benchmarks.lab {rest[0]}` in one"
         )

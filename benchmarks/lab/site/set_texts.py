@@ -40,7 +40,7 @@ class About:
 _EACH = tuple((objects, 0) for objects in (2, 4, 6, 8))
 _SHELF = (
     "A robustness set: what becomes of the method on {}, which no network was trained on. It goes with the shelf's "
-    "configuration file, and a study of the same name runs it."
+    "configuration file."
 )
 
 ABOUT: dict[str, About] = {
