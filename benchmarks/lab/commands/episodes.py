@@ -83,7 +83,7 @@ def bench_ceiling(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.ceiling import solvability
-    from mechsearch_jax.benchmarks.lab.tables import ceiling_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.envs.known_target.search import KnownSearchConfig
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
@@ -109,7 +109,8 @@ def bench_ceiling(
 
             rows.append(ceiling.row(scene, outcomes, on_round))
     solvability.save_ceiling(rows, ceiling.settings, _command(), out / "ceiling.json")
-    console.print(ceiling_table(rows))
+    print(as_text(solvability.summary(rows)))
+    print(as_text({"scene": row.scenario, "reason": row.reason} for row in rows if not row.solvable))
 
 
 def bench_cell(
@@ -142,6 +143,7 @@ def bench_cell(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import cell_searches as cell
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.runtime.files import check_writable
 
     at_least_one("lab cell", searches=searches, objects=min(objects, default=0))
@@ -164,7 +166,7 @@ def bench_cell(
 
         rows = cell.run_cell(config, out, conditions, starts, progress)
     cell.save_rows(rows, config, conditions, _command(), out / "cell.json")
-    console.print(cell.cell_table(rows))
+    print(as_text([cell.summary(rows)]))
     console.print(str(out / "cell.json"), soft_wrap=True)
     if any(row.error for row in rows):
         raise SystemExit(1)

@@ -65,7 +65,7 @@ def bench_agreement(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts.agreement import agreement, draw_actions, generated_scenes
-    from mechsearch_jax.benchmarks.lab.tables import agreement_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import save_json
@@ -82,7 +82,7 @@ def bench_agreement(
         cases = draw_actions(where, actions, seed)
         status.update("executing actions")
         result = agreement(cases)
-    console.print(agreement_table(result))
+    print(as_text({"kind": name, **line} for name, line in result.summary().items()))
     if out is not None:
         save_json(result.value(), out)
 
@@ -126,7 +126,7 @@ def bench_recognition(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, recognition
-    from mechsearch_jax.benchmarks.lab.tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
 
     check_files(out)
     places = _places("lab recognition", generated.config, scenarios)
@@ -146,9 +146,8 @@ def bench_recognition(
             for name, place in places.items()
         }
         measured = _measured(benches, places, status, out)
-    console.print(recognition_tables(measured))
-    if measured.times:
-        console.print(recognition_times_table(measured))
+    print(as_text(measured.summary()))
+    print(as_text({"method": name, **time.value()} for name, time in measured.times.items()))
 
 
 def _measured(
@@ -209,7 +208,7 @@ def bench_segmentation(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, segmentation
-    from mechsearch_jax.benchmarks.lab.tables import segmentation_tables
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.viz.drawing import save_figure
 
@@ -229,7 +228,7 @@ def bench_segmentation(
         if picture is not None:
             status.update("drawing")
             save_figure(segmentation.worst_figure(bench, measured.rows, worst), picture)
-    console.print(segmentation_tables(measured))
+    print(as_text(measured.summary()))
 
 
 def bench_push(
@@ -261,7 +260,7 @@ def bench_push(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import push
-    from mechsearch_jax.benchmarks.lab.tables import push_scores_tables
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable, save_json
     from mechsearch_jax.train.run import counting
@@ -282,7 +281,8 @@ def bench_push(
         measured = bench.run(made, lambda name, done: status.update(f"{name}: {done}/{total}"))
         if out is not None:
             save_json(measured.value(), out)
-    console.print(push_scores_tables(measured))
+    groups = ((model, name, line) for model, lines in measured.scores.items() for name, line in lines.items())
+    print(as_text({"model": model, "group": name, **line} for model, name, line in groups))
 
 
 def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile = None) -> None:
@@ -296,7 +296,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import scenes
-    from mechsearch_jax.benchmarks.lab.tables import scenes_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]
@@ -312,7 +312,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
         rows = scenes.look_at_all(sources, lambda done: status.update(f"looking {done}/{total}"), exact)
     if out is not None:
         scenes.save_scenes(rows, out)
-    console.print(scenes_table(rows))
+    print(as_text(scenes.summary(rows)))
 
 
 def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = None) -> None:
@@ -329,7 +329,7 @@ def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import sensors
-    from mechsearch_jax.benchmarks.lab.tables import sensors_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.runtime.files import save_json
 
     check_files(out)
@@ -340,7 +340,7 @@ def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = 
         columns |= sensors.simulated_columns(scenes)
         if out is not None:
             save_json(columns, out)
-    console.print(sensors_table(columns))
+    print(as_text({"images": name, **figures} for name, figures in columns.items()))
 
 
 COMMANDS = {
