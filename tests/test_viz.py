@@ -83,10 +83,6 @@ def frame(target, **changes):
     return Frame(**{**fields, **changes})
 
 
-def axes_of(figure):
-    return [axes for axes in figure.axes if not axes.get_images() or axes.get_images()[0].get_array().shape[-1] == 4]
-
-
 def test_outlines_are_the_bodies_seen_from_above():
     box, round_one, lying, *absent = drawing.outlines(SCENE)
     assert absent == [None] * (SCENE.capacity - 3)
