@@ -93,7 +93,7 @@ def test_what_holds_no_episodes_is_refused(tmp_path, text, complaint):
 @pytest.fixture
 def ceiling(tmp_path, monkeypatch):
     """Searches that come to what `answers` says of a scene; `ceiling.searched` tells which were searched."""
-    ceiling = Ceiling(tmp_path, KnownSearchConfig(rounds=3), 5)
+    ceiling = Ceiling(tmp_path, KnownSearchConfig(rounds=3))
     ceiling.searched, ceiling.answers = [], {}
 
     def known_search(scenario, *rest):
@@ -128,7 +128,7 @@ def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, mon
     ceiling.row(HIDDEN, outcomes)
     monkeypatch.setattr(solvability, "present_code", lambda: "other code")
     ceiling.row(TWO, outcomes)
-    other = Ceiling(tmp_path, KnownSearchConfig(rounds=4), 5)
+    other = Ceiling(tmp_path, KnownSearchConfig(rounds=4))
     assert other.settings != ceiling.settings
     assert ceiling.searched == ["two", "hidden", "hidden", "two"]
 

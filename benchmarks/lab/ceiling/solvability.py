@@ -30,6 +30,9 @@ from mechsearch_jax.runtime.files import PathLike, read_json, save_json
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
 
+# Sampled from each world of a round.
+SEQUENCES = 64
+
 
 @dataclasses.dataclass(frozen=True)
 class CeilingRow:
@@ -126,14 +129,13 @@ class Ceiling:
       settings: all settings that determine a search's result, beside its scene.
     """
 
-    def __init__(self, folder: PathLike, config: KnownSearchConfig, sequences: int) -> None:
+    def __init__(self, folder: PathLike, config: KnownSearchConfig) -> None:
         """Args:
         folder: for a file of every searched scene.
         config: the budget of a search.
-        sequences: sampled from each world of a round.
         """
         self._folder, self._config = Path(folder), config
-        self._planner: Config = PRESETS["standard"](sequences=sequences, max_steps=config.max_steps)
+        self._planner: Config = PRESETS["standard"](sequences=SEQUENCES, max_steps=config.max_steps)
         self._simulator = NativeSimulator()
         self._problem = functools.cache(cached_problem)
         first, later = push_models(self._planner.push_model)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import sys
 from collections.abc import Sequence
@@ -40,36 +39,14 @@ def _scenes(command: str, names: Sequence[str]) -> list[Scenario]:
     return scenes
 
 
-@dataclasses.dataclass(frozen=True)
-class KnownSearch:
-    """How much is tried in the search of a scene.
-
-    Attributes:
-      sequences: sampled from each world of a round.
-      simulated: so many of them, the best, are executed in a round.
-      worlds: from which sequences are sampled in a round: those nearest to being solved.
-      rounds: of each search, at most.
-      grasps: that are tried out to take the target out of a world.
-      max_steps: actions, the retrieval among them.
-      seed: of the search.
-    """
-
-    sequences: int = 64
-    simulated: int = 32
-    worlds: int = 4
-    rounds: int = 40
-    grasps: int = 8
-    max_steps: int = 30
-    seed: int = 0
-
-
 def bench_ceiling(
     scenarios: SomeScenarios,
     /,
     *,
     out: Path,
     results: Results = (),
-    effort: Annotated[KnownSearch, tyro.conf.arg(name="")] = KnownSearch(),
+    rounds: int = 40,
+    seed: int = 0,
 ) -> None:
     """Tell what share of scenes can be solved at all; those that no episode solved are searched with everything known.
 
@@ -78,7 +55,8 @@ def bench_ceiling(
       out: folder for a file for every scene that is searched, and ceiling.json. Scenes that have a file of the same
         code and options are not searched again.
       results: of `evaluate` (folders, .parquet) and stored ones (.json); what was retrieved in any is solvable.
-      effort: how much is tried.
+      rounds: of each search, at most.
+      seed: of the searches.
     """
     from rich.console import Console
 
@@ -88,14 +66,12 @@ def bench_ceiling(
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
 
-    config = dataclasses.asdict(effort)
-    sequences = config.pop("sequences")
-    at_least_one("lab ceiling", sequences=sequences, **{name: config[name] for name in config if name != "seed"})
+    at_least_one("lab ceiling", rounds=rounds)
     scenes = _scenes("ceiling", scenarios)
     outcomes = solvability.read_outcomes(results)
     check_writable(out)
     keep_compilations()
-    ceiling = solvability.Ceiling(out, KnownSearchConfig(**config), sequences)
+    ceiling = solvability.Ceiling(out, KnownSearchConfig(rounds=rounds, seed=seed))
     console = Console(highlight=False)
     rows: list[solvability.CeilingRow] = []
     with console.status("searching") as status:
