@@ -117,7 +117,6 @@ WRONG = {
     "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
     "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
-    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "two scenes are called one-box"),
     "results in a file": (
         ["evaluate", "good.json", "--out", "out/rows.parquet"],
         "rows.parquet: results are kept in a folder, not in a file",
