@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import sys
 import types
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.page.page import stamp
 from mechsearch_jax.envs.recording.recording import save_recording
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded
-from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
@@ -75,26 +73,6 @@ def test_the_pictures_of_the_method_are_of_the_shipped_scene(name):
     today = load_scenario(example_scenarios()[method_pictures.SCENE]).content_hash
     assert shows == today, f"run `python -m {method_pictures.__name__}`"
     assert f"](pictures/{name}.png)" in (ROOT / "docs/pictures.md").read_text(encoding="utf-8")
-
-
-def test_a_recording_of_another_scene_is_refused(tmp_path, monkeypatch):
-    save_recording(RECORDING, tmp_path / "recording.npz")
-    monkeypatch.setattr(sys, "argv", ["method_pictures", "--recording", str(tmp_path / "recording.npz")])
-    with pytest.raises(SystemExit, match=r"recording\.npz: is of another scene than crowded-shelf; [^\n]*$"):
-        method_pictures.main()
-
-
-def test_a_recording_of_the_scene_is_taken():
-    scenario = load_scenario(example_scenarios()[method_pictures.SCENE])
-    world = from_scenario(scenario)
-    for shift, accepted in ((0.001, True), (0.05, False)):
-        first = dataclasses.replace(RECORDING.steps[0], world=world.replace(position=world.position + shift))
-        recording = dataclasses.replace(RECORDING, steps=(first,))
-        if accepted:
-            method_pictures.check_scene(recording, scenario, Path("a.npz"))
-        else:
-            with pytest.raises(InputError, match="another scene"):
-                method_pictures.check_scene(recording, scenario, Path("a.npz"))
 
 
 def test_steps_that_are_left_out_are_counted():
