@@ -376,29 +376,6 @@ def test_a_policy_goes_by_a_methods_name_or_its_own():
     assert policies("--policy", "random", "my_lab.policies:Mine") == ("random", "my_lab.policies:Mine")
 
 
-@pytest.mark.parametrize("given", [("--draws", "3"), ("--first-draws=3",), ("--grasp-tilts", "0.1", "0.2")])
-def test_what_is_no_option_any_more_is_refused_with_what_it_is_fixed_at(given):
-    name = given[0].partition("=")[0]
-    with pytest.raises(
-        InputError, match=rf"^{name} is no option any more: it is fixed at [\d. ]+ \(in preset paper at "
-    ):
-        cli.parse(["evaluate", "first-light", "--out", "out", *given])
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    {
-        "--rehearsal": "--rehearsal is called --trials now",
-        "--world-mass-spread": "--world-mass-spread is a key of --world now: mass_spread",
-        "--color-noise": "--color-noise is a key of --world now: colour_noise",
-        "--holes": "--holes is a key of --world now: holes",
-    }.items(),
-)
-def test_what_has_another_name_now_is_refused_with_it(given, message):
-    with pytest.raises(InputError, match=f"^{message}$"):
-        cli.parse(["evaluate", "first-light", "--out", "out", given, "2"])
-
-
 def test_help_names_options_with_their_defaults(capsys):
     with pytest.raises(SystemExit) as end:
         cli.parse(["bench", "plan", "--help"])

@@ -33,7 +33,6 @@ from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
-from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, Note, nearest
 from mechsearch_jax.runtime.own_settings import OWN
 
@@ -174,8 +173,6 @@ def call_of(program: str, description: str | None, commands: Commands, arguments
     except SystemExit as end:
         if not end.code:
             raise
-        for fixed in filter(None, map(refusal, (part for part in rest if part.startswith("--")))):
-            raise InputError(fixed) from None
         helpful = f"{program} {name}" if name in commands else program
         raise InputError(f"{one_line(complaint.getvalue())} ({helpful} --help tells more)") from None
     return command
