@@ -1,16 +1,12 @@
-"""The first picture: two films of one scene, one above the other, of a search that takes a few actions."""
+"""The first picture: two films of one scene, one above the other."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
-from recordings import EPISODE, FOUND, LOST, RECORDING, step
 
-from mechsearch_jax.benchmarks.lab.site.first_picture import FEWEST, MOST, OUT, POLICIES, SCENE, both, check_search
+from mechsearch_jax.benchmarks.lab.site.first_picture import OUT, POLICIES, SCENE, both
 from mechsearch_jax.commands.options import find_scenario
-from mechsearch_jax.runtime.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,23 +28,6 @@ def test_the_shorter_film_stands_still_at_its_end():
     assert [(int(p[strip, 0, 0]), int(p[-1, 0, 0])) for p in pictures] == [(10, 40), (20, 40), (30, 40)]
     assert all(len(picture) % 2 == 0 for picture in pictures)
     assert (pictures[0][:strip] != pictures[0][strip + 20 : 2 * strip + 20]).any()
-
-
-def searched(pushes):
-    """A recording of so many pushes and a retrieval."""
-    steps = (*(step(f"{i + 1}  push") for i in range(pushes)), step("take the target out", **FOUND))
-    return dataclasses.replace(RECORDING, steps=steps)
-
-
-def test_a_scene_that_shows_no_search_is_refused():
-    check_search(searched(FEWEST - 1), LOST)
-    check_search(searched(MOST - 1), LOST)
-    for recording in (searched(FEWEST - 2), searched(MOST), dataclasses.replace(RECORDING, steps=RECORDING.steps[:2])):
-        with pytest.raises(InputError, match=f"{SCENE}: .* choose a scene whose hidden target is taken out"):
-            check_search(recording, LOST)
-    found = dataclasses.replace(RECORDING, episode=dataclasses.replace(EPISODE, retrieved=True))
-    with pytest.raises(InputError, match="take the target out, too; choose a scene where they do not"):
-        check_search(searched(MOST - 1), found)
 
 
 def test_the_picture_is_there_and_moves():

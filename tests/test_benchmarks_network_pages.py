@@ -1,4 +1,4 @@
-"""The networks' cards are what the files beside the weights and the stored benchmarks say."""
+"""The networks' pages are of the weights that ship, and their figures those of the stored benchmarks."""
 
 import hashlib
 import json
@@ -13,50 +13,38 @@ from mechsearch_jax.networks.weights import ARCHITECTURES
 from mechsearch_jax.runtime.errors import InputError
 
 ROOT = Path(__file__).parents[1]
-ANEW = f"run `python -m {network_pages.__name__}`"
+RESULTS, CARDS = ROOT / network_pages.RESULTS, ROOT / network_pages.CARDS
+PAGES = {name: (ROOT / network_pages.OUT / f"{name}.md").read_text(encoding="utf-8") for name in ARCHITECTURES}
 
 
-def page(name, **folders):
-    return network_pages.page(
-        name, **{"results": ROOT / network_pages.RESULTS, "cards": ROOT / network_pages.CARDS, **folders}
-    )
-
-
-def test_every_network_has_a_card_and_a_place_in_the_navigation():
-    assert set(network_pages.CARD_OF) == set(ARCHITECTURES)
+def test_every_network_has_figures_and_a_place_in_the_navigation():
+    assert set(network_pages.FIGURES) == set(ARCHITECTURES)
     navigation = re.findall(r"networks/(.+)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(navigation) == sorted(ARCHITECTURES)
 
 
-@pytest.mark.parametrize("name", network_pages.CARD_OF)
-def test_a_card_is_what_the_stored_files_say(name):
-    assert (ROOT / network_pages.OUT / f"{name}.md").read_text(encoding="utf-8") == page(name), ANEW
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_the_figures_are_those_of_the_stored_file(name):
+    anew = network_pages.page(name, PAGES[name], RESULTS, CARDS)
+    assert anew == PAGES[name], f"run `python -m {network_pages.__name__}`"
 
 
-@pytest.mark.parametrize("name", network_pages.CARD_OF)
-def test_a_card_is_of_the_weights_that_ship(name):
-    digest = hashlib.sha256((ROOT / network_pages.CARDS / f"{name}.npz").read_bytes()).hexdigest()
-    assert f"`{digest}`" in page(name)
-
-
-def test_figures_are_those_of_the_stored_file():
-    stored = json.loads((ROOT / network_pages.RESULTS / "push-cpu.json").read_text(encoding="utf-8"))
-    scores = stored["models"]["learned"]["15 cm"]
-    row = f"| 15 cm | {scores['pushes']} | {scores['pushed_mm']:.1f} mm, {scores['pushed_deg']:.1f}° |"
-    assert row in page("push")
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_a_page_is_of_the_weights_that_ship_and_of_all_that_trained_them(name):
+    digest = hashlib.sha256((CARDS / f"{name}.npz").read_bytes()).hexdigest()
+    card = json.loads((CARDS / f"{name}.json").read_text(encoding="utf-8"))
+    assert f"`{digest}`" in PAGES[name]
+    assert f"{card['parameters']:,} parameters" in PAGES[name]
+    commands = []
+    while card:
+        commands.insert(0, card["command"])
+        card = card.get("started_from")
+    assert re.findall(r"^mechsearch train .*$", PAGES[name], re.MULTILINE) == commands
 
 
 def test_figures_of_other_weights_are_refused(tmp_path):
-    shutil.copy(ROOT / network_pages.CARDS / "push.json", tmp_path)
+    shutil.copy(CARDS / "push.json", tmp_path)
     card = json.loads((tmp_path / "push.json").read_text(encoding="utf-8"))
     (tmp_path / "push.json").write_text(json.dumps({**card, "sha256": "0" * 64}), encoding="utf-8")
     with pytest.raises(InputError, match=r"push-cpu\.json: is of other weights \(23a87126\w*\) than push\.npz \(0+\)"):
-        page("push", cards=tmp_path)
-
-
-def test_what_a_training_went_on_from_comes_first():
-    text = page("segmentation")
-    first, *later = re.findall(r"^mechsearch train .*$", text, re.MULTILINE)
-    assert "--start" not in first
-    assert len(later) == 3
-    assert all("--start" in command for command in later)
+        network_pages.page("push", PAGES["push"], RESULTS, cards=tmp_path)

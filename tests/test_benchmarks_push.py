@@ -13,9 +13,8 @@ from rich.console import Console
 
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.lab import __main__ as lab
-from mechsearch_jax.benchmarks.lab import tables
 from mechsearch_jax.benchmarks.lab.parts import push
-from mechsearch_jax.benchmarks.lab.parts.push import MeasuredPushes, PushBench, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.lab.parts.push import PushBench, held_out_generation, nudged, repeated
 from mechsearch_jax.benchmarks.parts import bench
 from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands import main as cli
@@ -212,62 +211,6 @@ def test_scores_are_written_with_how_they_came_about(measured, weights):
     assert "commit" in value
 
 
-LINE = {
-    "pushes": 4,
-    "failed": 0,
-    "toppled": 3,
-    "pushed_toppled": 2,
-    "pushed_mm": 12.345,
-    "pushed_deg": None,
-    "other_mm": 6.0,
-    "still": 0.5,
-    "topple_ap": 0.25,
-}
-SCORES = {
-    "no motion": {"all": LINE | {"pushed_mm": None}},
-    "quasi-static": {
-        "all": LINE,
-        "sideways": LINE | {"pushes": 91},
-        "10 cm": LINE | {"pushes": 3},
-        "1 objects": LINE | {"pushes": 1},
-        "8 objects": LINE | {"pushes": 2},
-        "10 cm, 8 objects": LINE | {"pushes": 97},
-    },
-    "nudged": {"all": LINE | {"pushed_mm": 1.0}},
-}
-
-
-def rows_of(table):
-    return [list(cells) for cells in zip(*(column.cells for column in table.columns), strict=True)]
-
-
-def test_the_tables_show_every_model_and_the_groups_of_the_best():
-    measured = MeasuredPushes(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
-    assert measured.best == "quasi-static"
-    group = tables.push_scores_tables(measured)
-    models, distances, objects, _ = group.renderables
-    numbers = ["-", "6.00", "0.500", "0.250"]
-    assert rows_of(models) == [
-        ["no motion", "4", "0", "3 (2)", "-", *numbers],
-        ["quasi-static", "4", "0", "3 (2)", "12.35", *numbers],
-        ["nudged", "4", "0", "3 (2)", "1.00", *numbers],
-    ]
-    assert [row[:2] for row in rows_of(distances)] == [["10 cm", "3"]]
-    assert [row[:2] for row in rows_of(objects)] == [["1", "1"], ["8", "2"]]
-    console = Console(file=io.StringIO(), width=100)
-    console.print(group)
-    printed = " ".join(console.file.getvalue().split())
-    assert "quasi-static, by distance" in printed
-    assert "of what falls over or off the board. All else leaves that out" in printed
-
-
-def test_the_learned_model_is_looked_at_closely_if_there_is_one():
-    measured = MeasuredPushes(
-        {"learned": {"all": LINE | {"pushed_mm": 99.0}}, **SCORES}, {}, {"pushes": 4}, {"device": "cpu"}
-    )
-    assert measured.best == "learned"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["learned", "quasi-static", "physics"])
 def test_predicting_is_timed(model, drawn, weights, monkeypatch):
@@ -302,7 +245,7 @@ def test_the_commands_measure_print_and_write(weights, tmp_path, capsys, monkeyp
     arguments = ["push", "--pushes", "6", "--worlds", "2", "--weights", str(weights), "--data", "data"]
     lab.parse([*arguments, "--out", "push.json", "--models", "no motion", "learned"])()
     printed = capsys.readouterr().out
-    assert "learned, by distance" in printed
+    assert "model learned, group all, pushes " in printed
     value = json.loads((tmp_path / "push.json").read_text())
     assert list(value["models"]) == ["no motion", "learned"]
     assert value["settings"]["pushes"] >= 6

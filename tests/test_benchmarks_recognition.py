@@ -1,7 +1,6 @@
-"""The comparison of recognisers: what counts, what is lost, what is written, and what the picture shows."""
+"""The comparison of recognisers: what counts, what is lost, and what is written."""
 
 import dataclasses
-import io
 import json
 import math
 from pathlib import Path
@@ -11,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.lab import tables
 from mechsearch_jax.benchmarks.lab.commands import quality
-from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure, recognition_methods
+from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_methods
 from mechsearch_jax.benchmarks.lab.parts.recognition import RecognitionBench, RecognitionRow
 from mechsearch_jax.benchmarks.lab.parts.recognition_methods import Method
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
@@ -21,7 +19,6 @@ from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.viz.drawing import save_figure
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -146,35 +143,6 @@ def test_a_file_holds_every_row_and_the_figures_that_follow_from_them(measured, 
     assert [p.name for p in tmp_path.iterdir()] == ["recognition.json"]
 
 
-def test_tables_name_every_method_and_fit_a_terminal(measured):
-    from rich.console import Console
-
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(tables.recognition_tables(measured))
-    console.print(tables.recognition_times_table(measured))
-    text = console.export_text()
-    assert "…" not in text
-    for name in METHODS:
-        assert text.count(f"\n{name} ") == 3
-    assert "files scenes, gaussian" in text
-
-
-def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
-    rows = recognition_figure.worst(measured.rows, "nan", 3)
-    assert rows[0].outcome == "not finite"
-    ious = [row.iou for row in measured.rows if row.method == "nan"]
-    assert [row.iou for row in rows] == sorted(ious)[:3]
-    figure = recognition_figure.worst_figure([bench], rows)
-    lines = [len(axes.lines) for axes in figure.axes]
-    # Both views of each: the truth alone where the answer cannot be drawn.
-    assert lines == [1, 1, 1, 1, 2, 2]
-    assert "IoU 0.00" in figure.subfigs[0].get_suptitle()
-    save_figure(figure, tmp_path / "worst.png")
-    assert (tmp_path / "worst.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(InputError, match="no 0 answers"):
-        recognition_figure.worst(measured.rows, "nan", 0)
-
-
 @pytest.mark.slow
 def test_held_out_scenes_are_reproducible_and_their_seeds_checked():
     first, again, other = (images.held_out_scenes(2, seed) for seed in (0, 0, 1))
@@ -257,10 +225,9 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
     files = [tmp_path / f"{name}.toml" for name in places]
     for file, left in zip(files, places.values(), strict=True):
         file.write_text(PLACE.format(left=left))
-    out, picture = tmp_path / "places.json", tmp_path / "worst.png"
+    out = tmp_path / "places.json"
     measured = {"noise": ("clean",), "method": ("network-refined",), "out": out}
-    generated, drawn = quality.GeneratedScenes(tuple(files), 1), quality.WorstPicture(picture, 2)
-    quality.bench_recognition(generated=generated, drawn=drawn, **measured)
+    quality.bench_recognition(generated=quality.GeneratedScenes(tuple(files), 1), **measured)
     assert [shelf.left for shelf in stood] == list(places.values())
     assert [shelf.left for _, shelf in seen] == list(places.values())
     assert {camera.fx for camera, _ in seen} == {76.2}
@@ -270,9 +237,8 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
     assert {name: place["shelf"]["left"] for name, place in value["settings"]["places"].items()} == places
     assert value["settings"]["held_out_scenes"] == 1
     assert value["seconds_per_object"] == {}
-    assert picture.read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
-    assert all(f"{name} scenes, clean" in printed for name in places)
+    assert all(f"source {name}, noise clean, method network-refined" in printed for name in places)
 
 
 @pytest.mark.parametrize(

@@ -234,16 +234,6 @@ def test_confidence_intervals_are_wilsons():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-def test_confidence_intervals_are_those_of_the_formula():
-    z = 1.959963984540054
-    for count in (1, 2, 7, 100):
-        for successes in range(count + 1):
-            share = successes / count
-            middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
-            half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-            assert wilson(successes, count) == pytest.approx((middle - half, middle + half), abs=1e-12)
-
-
 def test_every_option_is_a_column(tmp_path):
     method = Method(config=PRESETS["standard"](gamma=0.5, push_distances=(0.1,), max_steps=7))
     options = {**method.options(), "target": "box", "simulator": "NativeSimulator", "seed": 3}

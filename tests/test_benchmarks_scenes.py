@@ -11,7 +11,6 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
 from mechsearch_jax.benchmarks.lab.parts import scenes
 from mechsearch_jax.benchmarks.lab.parts.exact_existence import exact_existence
 from mechsearch_jax.benchmarks.lab.parts.scenes import SceneRow, look_at_all, nearest_pose, save_scenes, summary
-from mechsearch_jax.benchmarks.lab.tables import scenes_table
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
@@ -161,5 +160,3 @@ def test_figures_are_those_of_the_rows(tmp_path):
     assert value["code"] == present_code()
     with pytest.raises(InputError, match="there are no scenes"):
         save_scenes([], tmp_path / "none.json")
-    table, *_ = scenes_table(rows).renderables
-    assert table.row_count == 3

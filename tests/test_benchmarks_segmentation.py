@@ -1,15 +1,12 @@
 """The measurement of segmentation: what counts, what is missed, what is written, and what the picture shows."""
 
 import dataclasses
-import io
 import json
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
-from mechsearch_jax.benchmarks.lab import tables
 from mechsearch_jax.benchmarks.lab.parts import images, segmentation
 from mechsearch_jax.benchmarks.lab.parts.segmentation import SegmentationBench, overlaps, true_masks
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
@@ -69,14 +66,6 @@ def test_results_are_written_with_their_rows(perfect, tmp_path):
     assert value["summary"] == perfect.summary()
     rows = [segmentation.SegmentRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
     assert rows == list(perfect.rows)
-
-
-def test_the_table_shows_every_group(wrong):
-    console = Console(file=io.StringIO(), width=120)
-    console.print(tables.segmentation_tables(wrong.run()))
-    text = console.file.getvalue()
-    assert "files scenes, clean" in text
-    assert "files scenes, gaussian" in text
 
 
 def test_the_picture_shows_the_worst_images_first(wrong, tmp_path):

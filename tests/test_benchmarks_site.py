@@ -1,8 +1,7 @@
-"""The pages of scene sets are what declared sets and stored runs say, and pictures show today's scenes."""
+"""The pages of scene sets are of the declared sets, and pictures show today's scenes."""
 
 import dataclasses
 import re
-import sys
 import types
 from pathlib import Path
 
@@ -11,69 +10,50 @@ from PIL import Image
 from recordings import RECORDING
 from stored_rows import USUAL, row_of
 
-from mechsearch_jax.benchmarks.lab.site import all_pages, gallery, method_pictures, set_pages
-from mechsearch_jax.benchmarks.lab.site.set_texts import ABOUT, sets_of
+from mechsearch_jax.benchmarks.lab.site import all_pages, gallery, method_pictures, set_pictures
 from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.options import find_scenario
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.page.page import stamp
 from mechsearch_jax.envs.recording.recording import save_recording
-from mechsearch_jax.envs.scenes.scene_sets import SETS, recorded
-from mechsearch_jax.envs.world.world import from_scenario
+from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs/scene-sets"
-SHOWN = [name for name, about in ABOUT.items() if about.shown]
+PAGES = {file.stem: file.read_text(encoding="utf-8") for file in sorted(FOLDER.glob("*.md"))}
+SHOWN = [name for name, text in PAGES.items() if set_pictures.shown_on(text)]
+DRAW_SETS = f"run `python -m {set_pictures.__name__}`"
 
 
-PAGES_OF_SETS = f"run `python -m {set_pages.__name__}`"
-NAMES = "benchmarks/lab/site/set_texts.py"
+@pytest.mark.parametrize("name", [name for name, scene_set in SETS.items() if scene_set.about])
+def test_every_set_is_on_a_page_as_it_is(name):
+    first = SETS[name].blocks[0]
+    seeds = f"{first.first_seed} to {first.first_seed + first.scenes - 1}"
+    row = rf"^\| `{name}` \| {SETS[name].scenes} \|.*\| {seeds} \|.*\| {digest(SETS[name])} \|$"
+    assert any(re.search(row, text, re.MULTILINE) for text in PAGES.values()), digest(SETS[name])
 
 
-def test_every_set_is_on_a_page():
-    on_pages = [each for name in ABOUT for each in sets_of(name) if each != "published"]
-    declared = [name for name, each in SETS.items() if each.about]
-    assert sorted(on_pages) == sorted(declared), f"give each set of scene_sets.SETS an entry of ABOUT in {NAMES}"
-
-
-def test_the_pages_are_what_the_stored_runs_say():
-    pages = set_pages.pages(ROOT / "benchmarks/results")
-    written = {file.name: file.read_text(encoding="utf-8") for file in FOLDER.glob("*.md")}
-    assert set(written) == set(pages), f"{PAGES_OF_SETS}, and remove pages that it does not write"
-    different = [name for name, text in pages.items() if written[name] != text]
-    assert not different, PAGES_OF_SETS
-
-
-def test_every_set_has_a_page_in_the_navigation():
+def test_every_page_of_sets_is_in_the_navigation_and_the_list():
     navigation = re.findall(r"scene-sets/(.+)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
-    assert navigation == ["index", *ABOUT], f"let nav of mkdocs.yml list the entries of ABOUT in {NAMES}, in order"
+    assert sorted(navigation) == sorted(PAGES)
+    assert {f"{name}.md" for name in PAGES} - {"index.md"} <= set(re.findall(r"\(([\w-]+\.md)\)", PAGES["index"]))
 
 
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_picture_shows_the_scenes_on_record(name):
     with Image.open(FOLDER / f"{name}.png") as picture:
         hashes = picture.text["scenes"].split()
-    shown = set_pages.blocks_shown(SETS[name], ABOUT[name])
-    assert hashes == [recorded()[block.name][index] for block, index in shown], f"{PAGES_OF_SETS} with --pictures"
+    shown = set_pictures.shown_on(PAGES[name])
+    assert hashes == [recorded()[block.name][index] for block, index in shown], DRAW_SETS
     assert (FOLDER / f"{name}.png").stat().st_size < 400_000
 
 
 def test_pictures_are_of_sets_alone_that_may_be_looked_at():
-    drawn = {file.stem for file in FOLDER.glob("*.png")}
-    assert drawn == set(SHOWN), f"{PAGES_OF_SETS} with --pictures, and remove pictures that it does not draw"
+    assert {file.stem for file in FOLDER.glob("*.png")} == set(SHOWN), DRAW_SETS
     assert "report" not in SHOWN
-
-
-def test_a_page_names_what_ran_on_its_sets():
-    lines = [{"run": "some-run", "scene_set": "report-b"}, {"run": "another", "scene_set": "c2"}]
-    text = set_pages.page("report", lines)
-    assert "Stored runs: [some-run](../../benchmarks/results/runs/some-run.jsonl)." in text
-    assert "another" not in text
-    assert "mechsearch evaluate report-i --out rows" in text
-    assert "What ran on it" not in set_pages.page("shelf-wide", lines)
 
 
 def test_the_baseline_of_the_guide_to_many_variants_is_one_of_them():
@@ -93,26 +73,6 @@ def test_the_pictures_of_the_method_are_of_the_shipped_scene(name):
     today = load_scenario(example_scenarios()[method_pictures.SCENE]).content_hash
     assert shows == today, f"run `python -m {method_pictures.__name__}`"
     assert f"](pictures/{name}.png)" in (ROOT / "docs/pictures.md").read_text(encoding="utf-8")
-
-
-def test_a_recording_of_another_scene_is_refused(tmp_path, monkeypatch):
-    save_recording(RECORDING, tmp_path / "recording.npz")
-    monkeypatch.setattr(sys, "argv", ["method_pictures", "--recording", str(tmp_path / "recording.npz")])
-    with pytest.raises(SystemExit, match=r"recording\.npz: is of another scene than crowded-shelf; [^\n]*$"):
-        method_pictures.main()
-
-
-def test_a_recording_of_the_scene_is_taken():
-    scenario = load_scenario(example_scenarios()[method_pictures.SCENE])
-    world = from_scenario(scenario)
-    for shift, accepted in ((0.001, True), (0.05, False)):
-        first = dataclasses.replace(RECORDING.steps[0], world=world.replace(position=world.position + shift))
-        recording = dataclasses.replace(RECORDING, steps=(first,))
-        if accepted:
-            method_pictures.check_scene(recording, scenario, Path("a.npz"))
-        else:
-            with pytest.raises(InputError, match="another scene"):
-                method_pictures.check_scene(recording, scenario, Path("a.npz"))
 
 
 def test_steps_that_are_left_out_are_counted():

@@ -9,8 +9,7 @@ import pytest
 from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.lab.site import store_run
-from mechsearch_jax.benchmarks.lab.site.store_run import run_of, scene_set_of
-from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
+from mechsearch_jax.benchmarks.lab.site.store_run import OUTCOMES, run_of, scene_set_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.store.rows import episode_key

@@ -117,7 +117,6 @@ WRONG = {
     "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
     "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
-    "the same name twice in looks": (["lab", "looks", "good.json", "good.json"], "two scenes are called one-box"),
     "results in a file": (
         ["evaluate", "good.json", "--out", "out/rows.parquet"],
         "rows.parquet: results are kept in a folder, not in a file",
@@ -207,12 +206,7 @@ WRONG = {
     "no images": (["bench", "perceive", "--batch", "0"], "--batch 0 must be at least 1"),
     "nothing to segment": (["lab", "segmentation", "--scenes", "0"], "there are no scenes"),
     "no picture of segments": (["lab", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
-    "no picture": (["lab", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
     "the same scene twice": (["lab", "recognition", "good.json", "good.json"], "two scenes are called one-box"),
-    "picture of nothing": (
-        ["lab", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
-        "--worst-of network-refined is not among the methods",
-    ),
     "file in a file": (["lab", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
     "no pushes": (["lab", "push", "--pushes", "0"], "lab push: --pushes 0 must be at least 1"),
     "unknown seed of pushes": (["lab", "push", "--seed", "-1"], "lab push: --seed -1 must be from 0"),
@@ -263,17 +257,15 @@ def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, caps
 
 
 def test_what_a_checkout_alone_has_is_refused_with_the_way_there():
-    refused = [name for names in cli.IN_A_CHECKOUT.values() for name in names]
-    assert sorted(refused) == sorted(lab.COMMANDS)
-    for program, names in cli.IN_A_CHECKOUT.items():
-        for name in names:
-            with pytest.raises(InputError, match=f"run `python -m mechsearch_jax.benchmarks.lab {name}` in one"):
-                cli.parse([*program.split()[1:], name, "--help"])
+    assert sorted(cli.IN_A_CHECKOUT) == sorted(lab.COMMANDS)
+    for name in cli.IN_A_CHECKOUT:
+        with pytest.raises(InputError, match=f"run `python -m mechsearch_jax.benchmarks.lab {name}` in one"):
+            cli.parse(["bench", name, "--help"])
 
 
 def test_the_lab_is_a_program_of_a_checkout(folder):
     answer = subprocess.run(
-        [sys.executable, "-m", "mechsearch_jax.benchmarks.lab", "looks", "none.json"],
+        [sys.executable, "-m", "mechsearch_jax.benchmarks.lab", "scenes", "none.json"],
         cwd=Path(__file__).parents[1], capture_output=True, text=True,
     )  # fmt: skip
     assert answer.returncode == 2
@@ -382,29 +374,6 @@ def test_a_policy_goes_by_a_methods_name_or_its_own():
     assert policies() == ("search-for-grasp",)
     assert policies("--method", "search-and-grasp", "search-for-grasp") == ("search-and-grasp", "search-for-grasp")
     assert policies("--policy", "random", "my_lab.policies:Mine") == ("random", "my_lab.policies:Mine")
-
-
-@pytest.mark.parametrize("given", [("--draws", "3"), ("--first-draws=3",), ("--grasp-tilts", "0.1", "0.2")])
-def test_what_is_no_option_any_more_is_refused_with_what_it_is_fixed_at(given):
-    name = given[0].partition("=")[0]
-    with pytest.raises(
-        InputError, match=rf"^{name} is no option any more: it is fixed at [\d. ]+ \(in preset paper at "
-    ):
-        cli.parse(["evaluate", "first-light", "--out", "out", *given])
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    {
-        "--rehearsal": "--rehearsal is called --trials now",
-        "--world-mass-spread": "--world-mass-spread is a key of --world now: mass_spread",
-        "--color-noise": "--color-noise is a key of --world now: colour_noise",
-        "--holes": "--holes is a key of --world now: holes",
-    }.items(),
-)
-def test_what_has_another_name_now_is_refused_with_it(given, message):
-    with pytest.raises(InputError, match=f"^{message}$"):
-        cli.parse(["evaluate", "first-light", "--out", "out", given, "2"])
 
 
 def test_help_names_options_with_their_defaults(capsys):

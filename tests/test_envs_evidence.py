@@ -9,7 +9,7 @@ import pytest
 from recordings import EPISODE, LOST, OBJECTS, PUSH, RECORDING, SEQUENCES, SLOTS, stacked
 
 from mechsearch_jax.envs.episode.numbering import named_tried
-from mechsearch_jax.envs.known_target.in_the_way import blocking, grasps_in_words, least_sets, objects_in_words
+from mechsearch_jax.envs.known_target.in_the_way import blocking, least_sets, objects_in_words
 from mechsearch_jax.envs.recording.evidence import Forecasts, foreseen_rows
 from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
 from mechsearch_jax.envs.recording.sampled import Sampled
@@ -112,11 +112,6 @@ def test_least_sets_of_what_grasps_hit():
     hits[0, [1]], hits[1, [1, 4]], hits[2, [2, 3]], hits[3, [2, 3, 4]] = True, True, True, True
     assert least_sets(hits) == [(1,), (2, 3)]
     assert blocking(hits) == (1,)
-    assert grasps_in_words(hits) == (
-        "each of the 4 grasps that the arm can reach inside the shelf hits object 1, or objects 2 and 3"
-    )
-    assert grasps_in_words(hits[:1]) == "the only grasp that the arm can reach inside the shelf hits object 1"
-    assert grasps_in_words(hits[:0]) == "the arm can reach no grasp of the target inside the shelf"
     assert blocking(np.zeros((1, 5), bool)) == ()
 
 

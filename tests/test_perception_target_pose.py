@@ -140,7 +140,7 @@ def half_hidden(target, pose, shown, side):
 def test_a_narrow_part_of_a_flat_face_is_at_its_end_where_nothing_hides_the_rest(side):
     """Its points fit anywhere along the face, but a target that reached farther would be seen there."""
     target, rng, fits = (
-        Target.box().resized("box", (0.02, 0.025, 0.06)),
+        Target.of("box", (0.02, 0.025, 0.06)),
         np.random.default_rng(4),
         jax.jit(
             lambda points, depth, of_target: fitted_pose(

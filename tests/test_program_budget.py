@@ -62,22 +62,6 @@ def primitives(program):
     return counts
 
 
-def test_what_is_inside_loops_and_calls_counts_each_time():
-    @jax.jit
-    def twice(x):
-        return x * 2.0
-
-    def program(x):
-        x = jax.lax.fori_loop(0, 3, lambda i, x: x + 1.0, twice(x), unroll=False)
-        x = jax.lax.cond(x > 0.0, twice, lambda x: x, x)
-        return jax.lax.while_loop(lambda x: x < 5.0, twice, x)
-
-    counts = primitives(jax.make_jaxpr(program)(1.0).jaxpr)
-    assert counts["mul"] == 3
-    assert counts["cond"] == 1
-    assert counts["while"] + counts["scan"] == 2
-
-
 def decision(problem, belief, parts=None):
     """The program of a decision for a belief, with room for so many parts of each body."""
     settings = ms.search_for_grasp()

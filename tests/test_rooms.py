@@ -91,7 +91,7 @@ def test_packages_import_what_is_below_them_alone():
 def test_no_room_needs_one_that_needs_it():
     imported = arrows(*PACKAGES)
     assert ("envs", "simulators") in imported["envs", "trials"]
-    assert ("lab", "studies") in imported["lab", "commands"]
+    assert ("lab", "parts") in imported["lab", "commands"]
     assert circles(imported) == set()
 
 

@@ -40,7 +40,7 @@ def test_boxes_and_cylinders_stay_what_they_were():
         assert (target.yaws, target.turn, target.compound) == (yaws, math.pi, None)
         assert target.bottom == target.top == target.half_size[2]
         assert target.height(Shelf()) == Shelf().board + target.half_size[2]
-    assert Target().resized("box", (0.02, 0.03, 0.05)) == Target("box", (0.02, 0.03, 0.05), yaws=6)
+    assert Target().like(Target.of("box", (0.02, 0.03, 0.05))) == Target("box", (0.02, 0.03, 0.05), yaws=6)
 
 
 @pytest.mark.parametrize(

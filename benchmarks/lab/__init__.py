@@ -1,4 +1,4 @@
-"""Our own evidence: how good the parts are, studies, and the pages of the docs.
+"""Our own evidence: how good the parts are, and the pages of the docs.
 
 It runs in a checkout and is no part of the wheel; nothing outside of it imports it.
 """

@@ -1,18 +1,15 @@
-"""What is measured and compared for this package itself: `python -m mechsearch_jax.benchmarks.lab NAME ...`."""
+"""What is measured for this package itself: `python -m mechsearch_jax.benchmarks.lab NAME ...`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.lab import PROGRAM
-from mechsearch_jax.benchmarks.lab.commands import episodes, looks, quality
-from mechsearch_jax.benchmarks.lab.commands.study import study
+from mechsearch_jax.benchmarks.lab.commands import episodes, quality
 from mechsearch_jax.commands.main import Commands, call_of, run
 
 COMMANDS: Commands = {
-    "study": study,
     **quality.COMMANDS,
-    **looks.COMMANDS,
     **episodes.COMMANDS,
 }
 
@@ -24,7 +21,7 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
       InputError: the arguments are wrong.
       SystemExit: after help was printed.
     """
-    return call_of(PROGRAM, "Measure the parts, and compare variants, one command each.", COMMANDS, arguments)
+    return call_of(PROGRAM, "Measure the parts, one command each.", COMMANDS, arguments)
 
 
 def main() -> None:

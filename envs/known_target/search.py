@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions import Action, kind_of, no_action
+from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.episode.records import ActionRecord, record_action
 from mechsearch_jax.envs.known_target.judgement import Judgement, judge, retrievals_of, sample
@@ -101,9 +101,6 @@ class KnownSearchResult:
       start: the world at the start.
       rounds: number of rounds.
       simulated: number of actions that were executed, retrievals included.
-      sampled: number of first actions that were sampled, by kind and object: ("push", 2).
-      executed: number of actions that were carried out, by kind and object.
-      failed: number of actions that failed, by kind, object and reason.
       retrievals: number of attempted retrievals by failure reason, "" for success.
     """
 
@@ -112,9 +109,6 @@ class KnownSearchResult:
     start: Node
     rounds: int
     simulated: int
-    sampled: Counter[tuple[str, int]]
-    executed: Counter[tuple[str, int]]
-    failed: Counter[tuple[str, int, str]]
     retrievals: Counter[str]
 
 
@@ -203,9 +197,6 @@ class _Running:
         self._judges = jax.jit(jax.vmap(self._judge_one))
         world = jax.device_get(jax.tree.map(lambda a: a[0], simulator.reset([scenario])))
         self.rounds = self._simulated = 0
-        self._sampled: Counter[tuple[str, int]] = Counter()
-        self._executed: Counter[tuple[str, int]] = Counter()
-        self._failed: Counter[tuple[str, int, str]] = Counter()
         self._retrievals: Counter[str] = Counter()
         self._solution: tuple[ActionRecord, ...] | None = None
         (judgement,) = self._judged([world])
@@ -227,9 +218,6 @@ class _Running:
             start=self._start,
             rounds=self.rounds,
             simulated=self._simulated,
-            sampled=self._sampled,
-            executed=self._executed,
-            failed=self._failed,
             retrievals=self._retrievals,
         )
 
@@ -271,12 +259,11 @@ class _Running:
         """The sampled sequences whose first actions differ, best first."""
         sequences = jax.device_get(sample(self._policy, key, self._problem, node.world))
         room = self._config.max_steps - 1 - len(node.actions)
-        proposals: dict[tuple[str | int, ...], _Proposal] = {}
+        proposals: dict[tuple[int, ...], _Proposal] = {}
         for i in np.flatnonzero(np.isfinite(sequences.value)):
             actions = jax.tree.map(lambda a, i=i: a[i], sequences.actions)
             expected = node.cost + float(sequences.value[i])
             proposal = _Proposal(node, expected, actions, min(int(sequences.length[i]), room))
-            self._sampled[_named(actions, 0)] += 1
             proposals.setdefault(_first_step(actions), proposal)
         return list(proposals.values())
 
@@ -293,7 +280,6 @@ class _Running:
             outcome = self._acted(chosen, active)
             worlds = jax.device_get(self._simulator.world)
             for i in active:
-                self._note(chosen[i], outcome, i)
                 paths[i] = (*paths[i], record_action(chosen[i]))
             alive = [i for i in active if self._is_whole(outcome, worlds, i)]
             worlds_alive = [jax.tree.map(lambda a, i=i: a[i], worlds) for i in alive]
@@ -310,14 +296,6 @@ class _Running:
         none = jax.device_get(no_action())
         executed = [action if mask[i] else none for i, action in enumerate(actions)]
         return jax.device_get(self._simulator.execute(_stacked(executed), jnp.asarray(mask)))
-
-    def _note(self, action: Action, outcome: Outcome, i: int) -> None:
-        """Count an action that was executed in world `i`."""
-        reason = outcome.reason(i)
-        if reason is None:
-            self._executed[_named(action)] += 1
-        else:
-            self._failed[(*_named(action), reason)] += 1
 
     def _is_whole(self, outcome: Outcome, worlds: World, i: int) -> bool:
         """Whether world `i` can be expanded after an action."""
@@ -367,17 +345,11 @@ def _apart(a: Node, b: Node) -> float:
     return float(np.abs(a.world.position - b.world.position)[a.world.valid].max())
 
 
-def _named(action: Action, step: int | None = None) -> tuple[str, int]:
-    """Kind and object of an action, or of one in a sequence."""
-    kind, index = (action.kind, action.object) if step is None else (action.kind[step], action.object[step])
-    return kind_of(int(kind)).name, int(index)
-
-
-def _first_step(actions: Action) -> tuple[str | int, ...]:
+def _first_step(actions: Action) -> tuple[int, ...]:
     """A key that is equal for first actions that count as the same."""
     parts = [actions.T_world_gripper[0], actions.displacement[0], actions.T_world_place[0], actions.q7[0]]
     numbers = np.concatenate([np.ravel(part) for part in parts])
-    return (*_named(actions, 0), *np.round(numbers / STEP).astype(int).tolist())
+    return (int(actions.kind[0]), int(actions.object[0]), *np.round(numbers / STEP).astype(int).tolist())
 
 
 def _stacked(trees: Sequence[Any]) -> Any:

@@ -33,7 +33,6 @@ from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
-from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, Note, nearest
 from mechsearch_jax.runtime.own_settings import OWN
 
@@ -73,23 +72,8 @@ GROUPS: Mapping[str, Commands] = {
     "train": train.COMMANDS,
     "bench": bench.COMMANDS,
 }
-# What only a checkout has: benchmarks/lab.
-IN_A_CHECKOUT: Mapping[str, Sequence[str]] = {
-    "mechsearch": ("study",),
-    "mechsearch bench": (
-        "agreement",
-        "bodies",
-        "ceiling",
-        "cell",
-        "confidence",
-        "looks",
-        "push",
-        "recognition",
-        "scenes",
-        "segmentation",
-        "sensors",
-    ),
-}
+# What only a checkout has: benchmarks/lab, once commands of `mechsearch bench`.
+IN_A_CHECKOUT = ("agreement", "ceiling", "cell", "push", "recognition", "scenes", "segmentation", "sensors")
 
 
 # Complete option types, which take a second to make, by the type in a command's signature.
@@ -158,7 +142,7 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     commands = GROUPS[group] if group else COMMANDS
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
     rest = list(arguments[1:] if group else arguments)
-    if rest and rest[0] in IN_A_CHECKOUT.get(program, ()):
+    if program == "mechsearch bench" and rest and rest[0] in IN_A_CHECKOUT:
         raise InputError(
             f"{program} {rest[0]} needs a checkout: run `python -m mechsearch_jax.benchmarks.lab {rest[0]}` in one"
         )
@@ -189,8 +173,6 @@ def call_of(program: str, description: str | None, commands: Commands, arguments
     except SystemExit as end:
         if not end.code:
             raise
-        for fixed in filter(None, map(refusal, (part for part in rest if part.startswith("--")))):
-            raise InputError(fixed) from None
         helpful = f"{program} {name}" if name in commands else program
         raise InputError(f"{one_line(complaint.getvalue())} ({helpful} --help tells more)") from None
     return command

@@ -21,7 +21,6 @@ from mechsearch_jax.commands.options import (
 )
 from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_episodes_of
 from mechsearch_jax.commands.world import swept
-from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.runtime.errors import InputError, nearest
 from mechsearch_jax.runtime.tables import checked, read_document
 
@@ -196,8 +195,7 @@ def _values(document: Document, table: str, types: Mapping[str, Any]) -> dict[st
     for key, value in document.tables.get(table, {}).items():
         where = document.where(table, key)
         if key not in types:
-            fixed = refusal(key)
-            raise InputError(f"{where}: {fixed}" if fixed else f"{where} is unknown; {nearest(key, types)}")
+            raise InputError(f"{where} is unknown; {nearest(key, types)}")
         if key in _SINGLE:
             values_of[key] = checked(value, types[key], where)
             continue

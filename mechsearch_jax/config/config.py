@@ -15,7 +15,6 @@ import jax
 from jaxtyping import Array
 
 from mechsearch_jax.actions.config import ActionConfig
-from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasping.config import GraspConfig
@@ -184,7 +183,7 @@ class Config:
         paths = {option.name: option.path for option in OPTIONS}
         for name, value in changes.items():
             if name not in paths:
-                raise InputError(refusal(name) or f"option {name} is unknown; there are {', '.join(paths)}")
+                raise InputError(f"option {name} is unknown; there are {', '.join(paths)}")
             config = _with(config, paths[name], tuple(value) if isinstance(value, list) else value)
         return config
 

@@ -1,4 +1,4 @@
-"""Options that this version has no more: the values that they are fixed at, or what they are called now."""
+"""Options of stored rows that this version has no more: what they are fixed at, or what they are called now."""
 
 from __future__ import annotations
 
@@ -52,41 +52,13 @@ FIXED: Mapping[str, Fixed] = {
 }
 
 
-# Keys of `--world` that were options of their own, some of them with `world_` before it.
-_OF_WORLD = frozenset(
-    (
-        *("friction", "mass", "friction_spread", "mass_spread", "size_spread", "physics", "arm_stop"),
-        *("camera_shift", "camera_turn", "shelf_shift", "shelf_turn", "depth_noise", "missing_depth", "holes"),
-        *("colour_noise", "exposure", "white_balance", "hue_gap"),
-    )
-)
-# What options are called now, by the names that files and rows of earlier versions have.
+# What options are called now, by the names that rows of earlier versions have.
 RENAMED: Mapping[str, str] = {
     "rehearsal": "trials",
     "color_noise": "colour_noise",
     "color": "colour",
     "colors": "colours",
 }
-
-
-def refusal(name: str) -> str | None:
-    """What to say to who gives an option that is fixed or has another name now, in one line; None if it is neither.
-
-    Args:
-      name: with underscores, or as on the command line.
-    """
-    given = name.partition("=")[0]
-    plain = given.removeprefix("--").replace("-", "_")
-    new = RENAMED.get(plain, plain)
-    if (key := new.removeprefix("world_")) in _OF_WORLD:
-        return f"{given} is a key of {'--world' if given.startswith('--') else '[world]'} now: {key}"
-    if new != plain:
-        return f"{given} is called {'--' + new.replace('_', '-') if given.startswith('--') else new} now"
-    fixed = FIXED.get(plain)
-    if fixed is None:
-        return None
-    paper = "" if fixed.in_paper == fixed.value else f" (in preset paper at {_text(fixed.in_paper)})"
-    return f"{given} is no option any more: it is fixed at {_text(fixed.value)}{paper}; leave it out"
 
 
 def renamed(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -111,8 +83,3 @@ def without_fixed(options: Mapping[str, Any]) -> dict[str, Any]:
         return {AS_IN_PAPER: True, **rest}
     others = {name: value for name, value in former.items() if value != FIXED[name].value}
     return {AS_IN_PAPER: False, **rest, **others}
-
-
-def _text(value: Any) -> str:
-    values = value if isinstance(value, list) else [value]
-    return " ".join(f"{part:.4g}" if isinstance(part, float) else str(part) for part in values)

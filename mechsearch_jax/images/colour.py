@@ -45,11 +45,6 @@ def chromaticity(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     return jnp.where(dark, 1.0 / 3.0, colours / jnp.where(dark, 1.0, total))
 
 
-def chromatic(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
-    """Mean squared difference of the chromaticities: the same in light and shadow."""
-    return mean_square(chromaticity(colours), chromaticity(reference))
-
-
 def chroma(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
     """Maximum minus minimum of red, green and blue: 0 for grey."""
     return jnp.max(colours, axis=-1) - jnp.min(colours, axis=-1)

@@ -65,7 +65,7 @@ def _distance(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
 
 
 @functools.partial(jax.jit, static_argnames=("network", "count", "config"))
-def recognise(
+def recognise_with_error(
     key: Key[Array, ""],
     network: RecognitionNetwork,
     parameters: Any,
@@ -75,8 +75,9 @@ def recognise(
     shelf: Shelf | None = None,
     count: int = 8,
     config: SegmentConfig | None = None,
-) -> Superquadrics:
-    """The network's superquadrics for the segments 0 to `count - 1` of a labelled image of points.
+) -> tuple[Superquadrics, Float[Array, " s"]]:
+    """The network's superquadrics for the segments 0 to `count - 1` of a labelled image of points, and its
+    `expected_error` of each [m].
 
     Slot i is segment i; it is not valid if the segment has fewer than `config.minimum` pixels.
 
@@ -90,22 +91,6 @@ def recognise(
       count: number of slots; static.
       config: how segments' clouds are drawn; static.
     """
-    return recognise_with_error(key, network, parameters, camera, points, labels, shelf, count, config)[0]
-
-
-@functools.partial(jax.jit, static_argnames=("network", "count", "config"))
-def recognise_with_error(
-    key: Key[Array, ""],
-    network: RecognitionNetwork,
-    parameters: Any,
-    camera: Camera,
-    points: Float[Array, "h w 3"],
-    labels: Int[Array, "h w"],
-    shelf: Shelf | None = None,
-    count: int = 8,
-    config: SegmentConfig | None = None,
-) -> tuple[Superquadrics, Float[Array, " s"]]:
-    """`recognise`, and the network's `expected_error` of each [m]."""
     from mechsearch_jax.networks.recognition import apply_network
 
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)

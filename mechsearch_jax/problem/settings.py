@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import OPTIONS, Config
-from mechsearch_jax.config.fixed import refusal
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.images.colour import HUE, LEAST_TARGET_SATURATION, RED, TargetColour, rgb_of_hue
 from mechsearch_jax.images.labels import CAPACITY, check_capacity
@@ -308,9 +307,6 @@ def _compound_target(document: Document, made_of: dict[str, Any]) -> Target:
 def _with_planner(document: Document, settings: Settings) -> Settings:
     """The settings with the planner's table."""
     types = {option.name: option.values for option in OPTIONS}
-    for key in document.tables.get(PLANNER, {}):
-        if fixed := refusal(key):
-            raise InputError(f"{document.where(PLANNER, key)}: {fixed}")
     check_names(document, PLANNER, {"preset": str, **types})
     table = dict(document.tables.get(PLANNER, {}))
     preset = checked(table.pop("preset", DEFAULT_PRESET), Literal[tuple(PRESETS)], document.where(PLANNER, "preset"))

@@ -42,7 +42,7 @@ def check_once(what: str, names: Iterable[str]) -> None:
     """Check that no name is given twice, as the results of both could not be told apart.
 
     Args:
-      what: is named, as "lab looks: two scenes".
+      what: is named, as "lab scenes: two sources".
       names: of all.
 
     Raises:

@@ -295,16 +295,6 @@ class Target:
         same = self.shape == other.shape and self.solid.round == other.solid.round and self.turn == other.turn
         return dataclasses.replace(other, grid=self.grid, inset=self.inset, yaws=self.yaws if same else other.yaws)
 
-    def resized(self, shape: str, half_size: tuple[float, float, float]) -> Target:
-        """A target of a shape and half-extents [m] with this one's grid and inset.
-
-        It has this target's yaw angles if the shape is the same, else the other shape's usual ones.
-
-        Raises:
-          InputError: as `of`.
-        """
-        return self.like(Target.of(shape, half_size))
-
     @classmethod
     def cylinder(cls) -> Target:
         return cls.of("cylinder")

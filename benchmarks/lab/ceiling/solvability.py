@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mechsearch_jax.benchmarks.lab.ceiling import unsolved
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.json_rows import save_rows
@@ -29,8 +28,10 @@ from mechsearch_jax.problem.cache import cached_problem
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, read_json, save_json
 from mechsearch_jax.runtime.versions import versions
-from mechsearch_jax.viz.drawing import save_figure
 from mechsearch_jax.workspace.scenario import Scenario
+
+# Sampled from each world of a round.
+SEQUENCES = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +48,7 @@ class CeilingRow:
       rounds, simulated: number of the search's rounds and executed actions; None if it did not run.
       seconds: wall time of the search [s].
       path: the search's actions, each with the fields of an `ActionRecord`.
-      reason: why the search failed; None if the scene is solvable.
+      reason: how near a search that failed came; None if the scene is solvable.
     """
 
     scenario: str
@@ -128,14 +129,13 @@ class Ceiling:
       settings: all settings that determine a search's result, beside its scene.
     """
 
-    def __init__(self, folder: PathLike, config: KnownSearchConfig, sequences: int) -> None:
+    def __init__(self, folder: PathLike, config: KnownSearchConfig) -> None:
         """Args:
-        folder: for a file of every searched scene, and a picture if the search failed.
+        folder: for a file of every searched scene.
         config: the budget of a search.
-        sequences: sampled from each world of a round.
         """
         self._folder, self._config = Path(folder), config
-        self._planner: Config = PRESETS["standard"](sequences=sequences, max_steps=config.max_steps)
+        self._planner: Config = PRESETS["standard"](sequences=SEQUENCES, max_steps=config.max_steps)
         self._simulator = NativeSimulator()
         self._problem = functools.cache(cached_problem)
         first, later = push_models(self._planner.push_model)
@@ -155,7 +155,7 @@ class Ceiling:
           on_round: see `known_search`.
 
         Raises:
-          InputError: the file or picture cannot be written.
+          InputError: the file cannot be written.
         """
         episodes, retrieved = outcomes.of(scenario)
         row = CeilingRow(
@@ -172,9 +172,6 @@ class Ceiling:
             problem = self._problem(target_of(scenario), self._planner.problem)
             result = known_search(scenario, problem, self._policy, self._simulator, self._config, on_round)
             columns = columns_of(result) | {"seconds": round(time.perf_counter() - begin, 1)}
-            if result.actions is None:
-                figure = unsolved.picture(result, problem, scenario.name, str(columns["reason"]))
-                save_figure(figure, self._folder / f"{scenario.name}.png")
             save_json({**identity, "versions": versions(), "found": columns}, file)
         return dataclasses.replace(row, **columns, solvable=columns["actions"] is not None)
 
@@ -186,8 +183,14 @@ def columns_of(result: KnownSearchResult) -> dict[str, Any]:
         "rounds": result.rounds,
         "simulated": result.simulated,
         "path": None if result.actions is None else [dataclasses.asdict(action) for action in result.actions],
-        "reason": None if result.actions is not None else unsolved.reason(result),
+        "reason": None if result.actions is not None else nearest(result.best),
     }
+
+
+def nearest(best: Node) -> str:
+    """How near to being solved the best world of a search is."""
+    hit = "no grasp" if best.judgement.least is None else f"{best.judgement.least} in the way"
+    return f"{hit} after {len(best.actions)} actions"
 
 
 def _stored_columns(file: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:

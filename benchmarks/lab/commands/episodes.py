@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import sys
 from collections.abc import Sequence
@@ -40,82 +39,54 @@ def _scenes(command: str, names: Sequence[str]) -> list[Scenario]:
     return scenes
 
 
-def _nearest(best: Node) -> str:
-    """How near to being solved the best world of a search is."""
-    hit = "no grasp" if best.judgement.least is None else f"{best.judgement.least} in the way"
-    return f"{hit} after {len(best.actions)} actions"
-
-
-@dataclasses.dataclass(frozen=True)
-class KnownSearch:
-    """How much is tried in the search of a scene.
-
-    Attributes:
-      sequences: sampled from each world of a round.
-      simulated: so many of them, the best, are executed in a round.
-      worlds: from which sequences are sampled in a round: those nearest to being solved.
-      rounds: of each search, at most.
-      grasps: that are tried out to take the target out of a world.
-      max_steps: actions, the retrieval among them.
-      seed: of the search.
-    """
-
-    sequences: int = 64
-    simulated: int = 32
-    worlds: int = 4
-    rounds: int = 40
-    grasps: int = 8
-    max_steps: int = 30
-    seed: int = 0
-
-
 def bench_ceiling(
     scenarios: SomeScenarios,
     /,
     *,
     out: Path,
     results: Results = (),
-    effort: Annotated[KnownSearch, tyro.conf.arg(name="")] = KnownSearch(),
+    rounds: int = 40,
+    seed: int = 0,
 ) -> None:
     """Tell what share of scenes can be solved at all; those that no episode solved are searched with everything known.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
-      out: folder for a file for every scene that is searched, a picture of each that stays unsolved, and ceiling.json.
-        Scenes that have a file of the same code and options are not searched again.
+      out: folder for a file for every scene that is searched, and ceiling.json. Scenes that have a file of the same
+        code and options are not searched again.
       results: of `evaluate` (folders, .parquet) and stored ones (.json); what was retrieved in any is solvable.
-      effort: how much is tried.
+      rounds: of each search, at most.
+      seed: of the searches.
     """
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.ceiling import solvability
-    from mechsearch_jax.benchmarks.lab.tables import ceiling_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.envs.known_target.search import KnownSearchConfig
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
 
-    config = dataclasses.asdict(effort)
-    sequences = config.pop("sequences")
-    at_least_one("lab ceiling", sequences=sequences, **{name: config[name] for name in config if name != "seed"})
+    at_least_one("lab ceiling", rounds=rounds)
     scenes = _scenes("ceiling", scenarios)
     outcomes = solvability.read_outcomes(results)
     check_writable(out)
     keep_compilations()
-    ceiling = solvability.Ceiling(out, KnownSearchConfig(**config), sequences)
+    ceiling = solvability.Ceiling(out, KnownSearchConfig(rounds=rounds, seed=seed))
     console = Console(highlight=False)
     rows: list[solvability.CeilingRow] = []
     with console.status("searching") as status:
         for scene in scenes:
 
             def on_round(number: int, best: Node, scene=scene) -> None:
-                line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {_nearest(best)}"
+                line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {solvability.nearest(best)}"
                 status.update(line)
                 if not console.is_terminal:
                     console.print(line, soft_wrap=True)
 
             rows.append(ceiling.row(scene, outcomes, on_round))
     solvability.save_ceiling(rows, ceiling.settings, _command(), out / "ceiling.json")
-    console.print(ceiling_table(rows))
+    print(as_text(solvability.summary(rows)))
+    print(as_text({"scene": row.scenario, "reason": row.reason} for row in rows if not row.solvable))
 
 
 def bench_cell(
@@ -148,6 +119,7 @@ def bench_cell(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import cell_searches as cell
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.runtime.files import check_writable
 
     at_least_one("lab cell", searches=searches, objects=min(objects, default=0))
@@ -170,7 +142,7 @@ def bench_cell(
 
         rows = cell.run_cell(config, out, conditions, starts, progress)
     cell.save_rows(rows, config, conditions, _command(), out / "cell.json")
-    console.print(cell.cell_table(rows))
+    print(as_text([cell.summary(rows)]))
     console.print(str(out / "cell.json"), soft_wrap=True)
     if any(row.error for row in rows):
         raise SystemExit(1)

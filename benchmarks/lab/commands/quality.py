@@ -65,7 +65,7 @@ def bench_agreement(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts.agreement import agreement, draw_actions, generated_scenes
-    from mechsearch_jax.benchmarks.lab.tables import agreement_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import save_json
@@ -82,24 +82,9 @@ def bench_agreement(
         cases = draw_actions(where, actions, seed)
         status.update("executing actions")
         result = agreement(cases)
-    console.print(agreement_table(result))
+    print(as_text({"kind": name, **line} for name, line in result.summary().items()))
     if out is not None:
         save_json(result.value(), out)
-
-
-@dataclasses.dataclass(frozen=True)
-class WorstPicture:
-    """A picture of the worst answers.
-
-    Attributes:
-      picture: PNG file for the worst answers of a method, beside the truth.
-      worst: how many of them.
-      worst_of: which method's.
-    """
-
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    worst: int = 12
-    worst_of: Recogniser = "network-refined"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +112,6 @@ def bench_recognition(
     method: tuple[Recogniser, ...] = get_args(Recogniser),
     ems_scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     out: JsonFile = None,
-    drawn: Annotated[WorstPicture, tyro.conf.arg(name="")] = WorstPicture(),
 ) -> None:
     """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
 
@@ -138,16 +122,13 @@ def bench_recognition(
       method: one or more; one that begins with another's answers brings it along.
       ems_scenes: number of scenes, spread evenly over all, for EMS, which is slow; all if not given.
       out: JSON file for the figures and for every object's row.
-      drawn: what is drawn.
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_figure
-    from mechsearch_jax.benchmarks.lab.tables import recognition_tables, recognition_times_table
-    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.benchmarks.lab.parts import images, recognition
+    from mechsearch_jax.benchmarks.lab.screen import as_text
 
-    at_least_one("lab recognition", worst=drawn.worst)
-    check_files(out, drawn.picture)
+    check_files(out)
     places = _places("lab recognition", generated.config, scenarios)
     given = images.scenes_of(_loaded(scenarios))
     console = Console(highlight=False)
@@ -164,18 +145,9 @@ def bench_recognition(
             )
             for name, place in places.items()
         }
-        if drawn.picture is not None and any(drawn.worst_of not in bench.methods for bench in benches.values()):
-            raise InputError(
-                f"lab recognition: --worst-of {drawn.worst_of} is not among the methods; add it to --method"
-            )
         measured = _measured(benches, places, status, out)
-        if drawn.picture is not None:
-            status.update("drawing")
-            rows = recognition_figure.worst(measured.rows, drawn.worst_of, drawn.worst)
-            save_figure(recognition_figure.worst_figure(list(benches.values()), rows), drawn.picture)
-    console.print(recognition_tables(measured))
-    if measured.times:
-        console.print(recognition_times_table(measured))
+    print(as_text(measured.summary()))
+    print(as_text({"method": name, **time.value()} for name, time in measured.times.items()))
 
 
 def _measured(
@@ -236,7 +208,7 @@ def bench_segmentation(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import images, segmentation
-    from mechsearch_jax.benchmarks.lab.tables import segmentation_tables
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.benchmarks.store.json_rows import save_rows
     from mechsearch_jax.viz.drawing import save_figure
 
@@ -256,7 +228,7 @@ def bench_segmentation(
         if picture is not None:
             status.update("drawing")
             save_figure(segmentation.worst_figure(bench, measured.rows, worst), picture)
-    console.print(segmentation_tables(measured))
+    print(as_text(measured.summary()))
 
 
 def bench_push(
@@ -288,7 +260,7 @@ def bench_push(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import push
-    from mechsearch_jax.benchmarks.lab.tables import push_scores_tables
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable, save_json
     from mechsearch_jax.train.run import counting
@@ -309,7 +281,8 @@ def bench_push(
         measured = bench.run(made, lambda name, done: status.update(f"{name}: {done}/{total}"))
         if out is not None:
             save_json(measured.value(), out)
-    console.print(push_scores_tables(measured))
+    groups = ((model, name, line) for model, lines in measured.scores.items() for name, line in lines.items())
+    print(as_text({"model": model, "group": name, **line} for model, name, line in groups))
 
 
 def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile = None) -> None:
@@ -323,7 +296,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.lab.parts import scenes
-    from mechsearch_jax.benchmarks.lab.tables import scenes_table
+    from mechsearch_jax.benchmarks.lab.screen import as_text
     from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]
@@ -339,7 +312,35 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
         rows = scenes.look_at_all(sources, lambda done: status.update(f"looking {done}/{total}"), exact)
     if out is not None:
         scenes.save_scenes(rows, out)
-    console.print(scenes_table(rows))
+    print(as_text(scenes.summary(rows)))
+
+
+def bench_sensors(*, scenes: int = 8, real: Path | None = None, out: JsonFile = None) -> None:
+    """Measure what the depth images of simulated sensors are like, and beside them real ones.
+
+    Args:
+      scenes: images of each sensor and view.
+      real: folder of folders of labelled images; each is a column.
+      out: JSON file for the figures.
+
+    Raises:
+      InputError: there are no images in the folder, or the file cannot be written.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.lab.parts import sensors
+    from mechsearch_jax.benchmarks.lab.screen import as_text
+    from mechsearch_jax.runtime.files import save_json
+
+    check_files(out)
+    at_least_one("lab sensors", scenes=scenes)
+    console = Console(highlight=False)
+    with console.status("measuring"):
+        columns = {} if real is None else sensors.real_columns(real)
+        columns |= sensors.simulated_columns(scenes)
+        if out is not None:
+            save_json(columns, out)
+    print(as_text({"images": name, **figures} for name, figures in columns.items()))
 
 
 COMMANDS = {
@@ -348,4 +349,5 @@ COMMANDS = {
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,
     "push": bench_push,
+    "sensors": bench_sensors,
 }

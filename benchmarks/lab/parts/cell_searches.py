@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.table import Table
 
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
@@ -338,26 +337,6 @@ def summary(rows: Sequence[CellRow]) -> dict[str, Any]:
         "errors": sum(row.error is not None for row in rows),
         "seconds_per_step_median": round(float(np.median(steady)), 2) if steady else None,
     }
-
-
-def cell_table(rows: Sequence[CellRow]) -> Table:
-    """One line for every search, and the counts of all."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for name in ("seed", "objects", "found after", "motions", "failed", "phantoms", "ended"):
-        table.add_column(name, justify="left" if name == "ended" else "right", no_wrap=True)
-    for row in rows:
-        found_after = "-" if row.found_step is None else str(row.found_step)
-        numbers = (row.seed, row.objects, found_after, row.motions, row.failed, row.phantoms)
-        table.add_row(*map(str, numbers), row.ended)
-    counts = summary(rows)
-    low, high = counts["retrieved_interval"]
-    table.add_row(
-        "all", "", str(counts["found"]), str(counts["motions"]), str(counts["failed_motions"]),
-        str(counts["looks_with_phantom_in_target"]),
-        f"{counts['retrieved']} of {counts['searches']} retrieved ({low:.2f} to {high:.2f})",
-        style="bold",
-    )  # fmt: skip
-    return table
 
 
 def save_rows(rows: Sequence[CellRow], config: Path, conditions: Conditions, command: str, path: PathLike) -> None:

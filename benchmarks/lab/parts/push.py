@@ -73,15 +73,6 @@ class MeasuredPushes:
     settings: dict[str, Any]
     versions: dict[str, str]
 
-    @property
-    def best(self) -> str:
-        """The learned model, or else the model with the least error of pushed objects."""
-        if "learned" in self.scores:
-            return "learned"
-        models = [name for name in self.scores if name != NUDGED] or list(self.scores)
-        errors = {name: self.scores[name]["all"]["pushed_mm"] for name in models}
-        return min(models, key=lambda name: np.inf if errors[name] is None else errors[name])
-
     def value(self) -> dict[str, Any]:
         """All groups of all rows as JSON values, with settings and versions."""
         return {

@@ -17,7 +17,7 @@ from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.recognition import RecognitionNetwork
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.recognition import recognise
+from mechsearch_jax.perception.recognition import recognise_with_error
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -58,7 +58,7 @@ def shipped_methods(camera: Camera, shelf: Shelf, weights: Weights | None = None
     network = cast(RecognitionNetwork, weights.network)
 
     def by_network(key: Array, shown: Shown, _: Superquadrics) -> Superquadrics:
-        return recognise(key, network, weights.parameters, camera, shown.points, shown.labels, shelf)
+        return recognise_with_error(key, network, weights.parameters, camera, shown.points, shown.labels, shelf)[0]
 
     def by_ems(key: Array, shown: Shown, _: Superquadrics) -> Superquadrics:
         points, labels = (np.asarray(a) for a in sampled_points(shown))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 
-from mechsearch_jax.benchmarks.lab.site import network_pages, reproduction_page, results_page, set_pages
+from mechsearch_jax.benchmarks.lab.site import network_pages, reproduction_page, results_page
 from mechsearch_jax.benchmarks.running import episode_seconds
 
 PAGES: dict[str, Callable[[Sequence[str]], None]] = {
     "benchmarks/running/episode_seconds.json": episode_seconds.main,
     "docs/reproduction.md": reproduction_page.main,
     "docs/results.md": results_page.main,
-    "docs/scene-sets": set_pages.main,
     "docs/networks": network_pages.main,
 }
 

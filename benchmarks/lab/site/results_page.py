@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mechsearch_jax.benchmarks.lab.site.rewriting import rewrite
-from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
+from mechsearch_jax.benchmarks.lab.site.store_run import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.preset_names import Settings, settings_of

@@ -1,4 +1,6 @@
-"""Pictures of scenes: what the camera sees, and the shelf from above.
+"""Draws the pictures of docs/scene-sets, of the scenes that its pages name: what the camera sees, and from above.
+
+`python -m mechsearch_jax.benchmarks.lab.site.set_pictures` at the root of a checkout.
 
 A picture holds the content hashes of its scenes as text of the PNG, so that a test can tell whether it shows what the
 sets hold today.
@@ -6,7 +8,10 @@ sets hold today.
 
 from __future__ import annotations
 
+import argparse
+import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +22,7 @@ from matplotlib.figure import Figure
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.recording.pictures import colour_image
-from mechsearch_jax.envs.scenes.scene_sets import SHELVES, Block, scene_files
+from mechsearch_jax.envs.scenes.scene_sets import SHELVES, Block, find_scene, scene_files
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.viz import drawing
@@ -25,16 +30,24 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
+OUT = Path("docs/scene-sets")
 # Key of the PNG's text with the content hashes.
 HASHES = "scenes"
 _WIDTH = 3.0
+
+
+def shown_on(page: str) -> list[tuple[Block, int]]:
+    """The scenes of a page's picture, as block and index, by the page's text; none where there is no picture."""
+    names = re.search(r"From left to right:\n(.*)\.$", page, re.MULTILINE)
+    scenes = map(find_scene, re.findall(r"`(.+?)`", names[1] if names else ""))
+    return [scene for scene in scenes if scene is not None]
 
 
 def draw(scenes: Sequence[tuple[Block, int]], path: PathLike) -> None:
     """Draw scenes of one set beside each other.
 
     Args:
-      scenes: of `set_pages.blocks_shown`.
+      scenes: of `shown_on`.
       path: of the PNG.
 
     Raises:
@@ -73,3 +86,15 @@ def _draw_scene(view: Axes, above: Axes, scene: Scenario, camera: Camera, shelf:
     drawing.draw_shelf(above, shelf)
     drawing.draw_objects(above, objects)
     drawing.draw_target(above, pose, target, certain=False)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Draw the pictures of all pages anew."""
+    argparse.ArgumentParser(description=f"Draw the pictures of {OUT}.").parse_args(arguments)
+    for page in sorted(OUT.glob("*.md")):
+        if scenes := shown_on(page.read_text(encoding="utf-8")):
+            draw(scenes, page.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

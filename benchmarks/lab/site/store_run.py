@@ -9,10 +9,9 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from mechsearch_jax.benchmarks.lab.studies.comparison import OUTCOMES
 from mechsearch_jax.benchmarks.paper.paper_tables import TABLES
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
@@ -21,6 +20,15 @@ from mechsearch_jax.benchmarks.store.rows import EpisodeRow, options_of
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, merged, started, variant_of, write_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
+
+# What an episode reaches, by what stored runs call it; None where a row does not say. An error reaches nothing.
+OUTCOMES: Mapping[str, Callable[[EpisodeRow], bool | None]] = {
+    "found": lambda row: row.found_step is not None,
+    "graspable": lambda row: row.graspable_step is not None,
+    "paper_graspable": lambda row: row.paper_graspable,
+    "retrieved": lambda row: row.retrieved,
+    "drop_free": lambda row: None if row.objects_fallen is None and not row.is_error else row.objects_fallen == 0,
+}
 
 
 def rates_of(rows: Sequence[EpisodeRow]) -> dict[str, Any]:

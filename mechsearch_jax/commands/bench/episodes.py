@@ -5,18 +5,13 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from mechsearch_jax.commands.options import JsonFile, at_least_one, check_files, files_of
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
-
-if TYPE_CHECKING:
-    pass
-
-Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FOLDER|FILE ...")]
 
 
 def _command() -> str:
