@@ -302,7 +302,7 @@ def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | N
     """
     return ObjectViews(
         windows=render.Window(
-            depth=jnp.full((capacity, *config.window), jnp.inf),
+            depth=jnp.full((capacity, *config.window), jnp.inf, jnp.float32),
             corner=jnp.zeros((capacity, 2), jnp.int32),
             stride=jnp.ones(capacity, jnp.int32),
         ),

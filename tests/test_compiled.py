@@ -361,7 +361,7 @@ SEARCH = """
     problem, policy = cached_problem(target_of(scene)), search_for_grasp(sequences=2, horizon=1)
     with prepared(first_decision(problem, policy, MotionConfig()), print):
         episode = run_episode(Start(scene, 0, max_steps=1), problem, policy, NativeSimulator())
-    names = "update_belief", "_plan", "pixels_in_window", "sizes_and_truths", "keys_at"
+    names = "update_belief", "first_draws", "_decided", "pixels_in_window", "sizes_and_truths", "keys_at"
     print(*(f"{name} {traced.count(name)}" for name in names))
     print([step.action for step in episode.steps], [step.cost for step in episode.steps])
 """
@@ -391,13 +391,14 @@ def run(script, folder):
 def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
     *lines, counts, first = run(SEARCH, tmp_path)
     assert lines[0].startswith("compiling: plan, belief, motion of ")
-    assert lines[0].endswith("; 0 of 6 done")
-    assert lines[-1] == "compiling; 6 of 6 done"
-    # What was prepared is what was called; where the action finds the target, the plan for a found one comes after it.
-    assert re.fullmatch("update_belief 1 _plan [12] pixels_in_window 1 sizes_and_truths 1 keys_at 1", counts)
+    assert lines[0].endswith("; 0 of 10 done")
+    assert lines[-1] == "compiling; 10 of 10 done"
+    # What was prepared is what was called; where the action finds the target, what only its plan has comes after it.
+    expected = "update_belief 1 first_draws 1 _decided [12] pixels_in_window 1 sizes_and_truths 1 keys_at 1"
+    assert re.fullmatch(expected, counts)
     *lines, counts, second = run(SEARCH, tmp_path)
     assert lines == []
-    assert counts == "update_belief 0 _plan 0 pixels_in_window 0 sizes_and_truths 0 keys_at 0"
+    assert counts == "update_belief 0 first_draws 0 _decided 0 pixels_in_window 0 sizes_and_truths 0 keys_at 0"
     assert second == first
 
 

@@ -18,7 +18,6 @@ from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.camera import Camera
@@ -272,7 +271,7 @@ def test_empty_slots_hide_nothing_in_a_plan(problem, camera):
 
     @jax.jit
     def planned(here, belief, objects):
-        root = Rollout(here, belief, policy.config, policy.propose, policy.predict, policy.objective).root(objects)
+        root = policy.rollout(here, belief).root(objects)
         bodies = root.scene.replace(valid=root.scene.valid & ~root.is_target)
         views = existence.object_views(here.existence, camera, bodies, None, settings, root.views, root.moved)
         f = existence.existence(here.existence, camera, views, root.exists, belief.allowed, settings)

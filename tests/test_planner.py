@@ -50,9 +50,13 @@ def seen(objects, found=False, pose=(0.0, 0.0, 0.0)):
     return Observation(objects, jnp.array(found), jnp.float32(pose))
 
 
+def evenly(problem, belief, objective, guided_fraction, state):
+    return jnp.ones(state.scene.capacity)
+
+
 def rollout_of(problem, belief, policy=POLICY):
     """What a decision of the engine begins with."""
-    return Rollout(problem, belief, policy.config, policy.propose, policy.predict, policy.objective)
+    return policy.rollout(problem, belief)
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +172,7 @@ def test_later_actions_are_drawn_in_the_predicted_scene(problem):
     _, objects = load("first-light")
     belief, shift = planner.initial_belief(problem), jnp.float32([0.0, 0.05, 0.0])
 
-    def draws_where_it_stands(key, problem, belief, objective, guided_fraction, state, wanted):
+    def draws_where_it_stands(key, problem, state, possible, weights, wanted):
         T = jnp.eye(4).at[:3, 3].set(state.scene.position[0])
         action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), T_world_gripper=T)
         return Sample(action, jnp.int32(0))
@@ -192,7 +196,7 @@ def test_later_actions_are_drawn_in_the_predicted_scene(problem):
             return jnp.sum(state.scene.position[0])
 
     config = dataclasses.replace(CONFIG, horizon=3, sequences=2)
-    rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective)
+    rollout = Drawn(problem, belief, config, evenly, moves, POLICY.objective, draws_where_it_stands)
     planned = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
     np.testing.assert_allclose(np.diff(planned.sequences.cost[0]), 0.05, atol=1e-6)
     starts = np.asarray(planned.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
@@ -202,7 +206,7 @@ def test_later_actions_are_drawn_in_the_predicted_scene(problem):
 def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(problem, root):
     belief = planner.initial_belief(problem)
 
-    def counts(key, problem, belief, objective, guided_fraction, state, wanted):
+    def counts(key, problem, state, possible, weights, wanted):
         return Sample(no_action().replace(q7=jax.random.uniform(key)), jnp.int32(0))
 
     def seldom(problem, state, sample, first):
@@ -210,7 +214,7 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
 
     def share(first, **changes):
         config = dataclasses.replace(CONFIG, **changes)
-        rollout = Rollout(problem, belief, config, counts, seldom, POLICY.objective)
+        rollout = Rollout(problem, belief, config, evenly, seldom, POLICY.objective, counts)
         keys = jax.random.split(jax.random.key(0), 4000)
         alive = jax.vmap(lambda key: rollout.act(first, root, key)[0]["alive"])(keys)
         return float(jnp.mean(alive))
@@ -225,7 +229,7 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
     monkeypatch.setattr(rollouts, "on_cpu", lambda: on_cpu)
     rows, draws, rounds = 200, 4, []
 
-    def counts(key, problem, belief, objective, guided_fraction, state, wanted):
+    def counts(key, problem, state, possible, weights, wanted):
         return Sample(no_action().replace(q7=jax.random.uniform(key), object=wanted.astype(jnp.int32)), jnp.int32(0))
 
     def note(q7, wanted):
@@ -237,7 +241,7 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
         possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *seen, vmap_method="broadcast_all")
         return Prediction(state.scene, state.scene.valid, possible)
 
-    rollout = Rollout(problem, planner.initial_belief(problem), CONFIG, counts, seldom, POLICY.objective)
+    rollout = Rollout(problem, planner.initial_belief(problem), CONFIG, evenly, seldom, POLICY.objective, counts)
     keys = jax.random.split(jax.random.key(0), rows)
     # The last is a sequence that has ended.
     states = repeated(root, rows).replace(alive=jnp.arange(rows) < rows - 1)
@@ -458,9 +462,9 @@ def drawn(decision, root, problem):
     @jax.jit
     def draw(problem, belief, root, keys):
         def one(key):
-            sample = POLICY.propose(
-                key, problem, belief, POLICY.objective, CONFIG.guided_fraction, root, jnp.array(True)
-            )
+            rollout = POLICY.rollout(problem, belief)
+            possible, weights = rollout.possible(root), rollout.weights(root)
+            sample = rollout.propose(key, problem, root, possible, weights, jnp.array(True))
             predict = lambda *shaky: foreseen(Shaky(*shaky))(problem, root, sample, True)  # noqa: E731
             prediction = jax.vmap(predict)(CHANCES, RESIDUALS)
             return sample, prediction.possible
@@ -494,7 +498,6 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
     policy = dataclasses.replace(
         POLICY,
         config=dataclasses.replace(CONFIG, unseen_contact_penalty=0.5),
-        propose=somewhere,
         predict=lambda _, state, *__: Prediction(state.scene, state.scene.valid, jnp.array(True)),
     )
     keys = jax.random.split(jax.random.key(0), 20)
@@ -504,10 +507,10 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
     drawn = jax.vmap(lambda key: somewhere(jax.random.fold_in(key, 0)))(keys)
     share = np.asarray(probability(drawn))
     assert len(np.unique(share[:, 0])) > 2
-    penalties = penalties_of(rollout_of(problem, belief, policy), root, keys)
-    np.testing.assert_allclose(penalties, 0.5 * share, rtol=1e-6)
-    policy = dataclasses.replace(policy, propose=lambda *_: Sample(action, jnp.int32(0)))
-    assert not penalties_of(rollout_of(problem, belief, policy), root, keys).any()
+    rollout = dataclasses.replace(rollout_of(problem, belief, policy), propose=somewhere)
+    np.testing.assert_allclose(penalties_of(rollout, root, keys), 0.5 * share, rtol=1e-6)
+    rollout = dataclasses.replace(rollout, propose=lambda *_: Sample(action, jnp.int32(0)))
+    assert not penalties_of(rollout, root, keys).any()
 
 
 def test_what_is_dear_is_not_chosen():

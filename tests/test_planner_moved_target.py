@@ -19,7 +19,6 @@ from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasping.graspability import INFEASIBLE, crowding, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.shapes.compound import Piece
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.target import Target
@@ -56,7 +55,7 @@ def belief(problem, objects):
 
 
 def rollout_of(problem, belief, policy=POLICY):
-    return Rollout(problem, belief, policy.config, policy.propose, policy.predict, policy.objective)
+    return policy.rollout(problem, belief)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.policies.occlusion import (
     EACH,
     NEXT,
-    draw_by_occlusion,
     most_occluding,
     most_occluding_first,
     occlusion_weights,
@@ -23,7 +22,7 @@ from mechsearch_jax.benchmarks.policies.occlusion import (
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.prediction import PredictByKind
-from mechsearch_jax.planner.proposal import WeightedDraw, guided_draw
+from mechsearch_jax.planner.proposal import sampling_weights
 from mechsearch_jax.runtime.identity import identity
 from mechsearch_jax.workspace import scenario
 
@@ -58,11 +57,11 @@ def object_of(decision, names):
     return names[int(decision.action.object)]
 
 
-def test_draws_by_other_weights_are_other_programs():
+def test_other_weights_are_other_programs():
     """Also on disk, where executables are kept; and equal ones in other processes are the same."""
-    draws = pickle.loads(pickle.dumps((guided_draw, draw_by_occlusion)))
-    assert draws == (guided_draw, draw_by_occlusion) == (guided_draw, WeightedDraw(occlusion_weights))
-    assert len({identity(draw) for draw in (guided_draw, draw_by_occlusion)}) == len(set(draws)) == 2
+    weights = (sampling_weights, occlusion_weights)
+    assert pickle.loads(pickle.dumps(weights)) == weights
+    assert len({identity(each) for each in weights}) == 2
 
 
 @dataclasses.dataclass(frozen=True)

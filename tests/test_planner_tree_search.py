@@ -51,7 +51,11 @@ class Line(Rollout):
         return jnp.asarray(COSTS)[jnp.clip(place + 2, 0, 4)]
 
 
-def to_either_side(key, problem, belief, objective, guided_fraction, state, wanted):
+def evenly(problem, belief, objective, guided_fraction, state):
+    return jnp.ones(state.scene.capacity)
+
+
+def to_either_side(key, problem, state, possible, weights, wanted):
     side = jnp.where(jax.random.bernoulli(key), STEP, -STEP)
     action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), displacement=jnp.array([0.0, 1.0, 0.0]) * side)
     return Sample(action, jnp.int32(0))
@@ -82,7 +86,7 @@ def decide(problem, objects):
     def compiled(predict, horizon):
         def decided(key, gamma, objects):
             config = dataclasses.replace(CONFIG, gamma=gamma, horizon=horizon)
-            rollout = Line(problem, belief, config, to_either_side, predict, None, start=start)
+            rollout = Line(problem, belief, config, evenly, predict, None, to_either_side, start=start)
             return tree_plan(rollout, key, objects)
 
         return jax.jit(decided)

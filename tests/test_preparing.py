@@ -4,6 +4,7 @@ import threading
 import time
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from mechsearch_jax.actions import KINDS, no_action
@@ -17,7 +18,8 @@ from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.grasping.retrieval import top_grasps
-from mechsearch_jax.planner import policies, search_for_grasp
+from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.planner.rollout import begin, shapes_of_parts
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.session import preparing
 from mechsearch_jax.session.preparing import Preparing, Program, first_decision, motions, prepare, prepared
@@ -134,7 +136,7 @@ def test_a_policy_of_a_users_own_is_compiled_when_it_is_called(problem):
 
     others = ["belief", *(f"motion of {kind.name}" for kind in KINDS.values())]
     assert names(lambda *_: None) == others
-    assert names(search_for_grasp()) == ["plan", *others]
+    assert names(search_for_grasp()) == ["plan"] * 5 + others
 
 
 MUG = Target.from_parts((Piece("cylinder", (0.03, 0.03, 0.05)), Piece("box", (0.02, 0.005, 0.03), (0.04, 0.0, 0.0))))
@@ -181,15 +183,40 @@ def test_what_a_search_compiles_ahead_is_what_it_calls(problem, monkeypatch, cas
         "hits": [(evidence.grasps_at, (problem.target_grasps, there, pose))],
         "g": [(graspability_map, (problem, belief, seen.objects))],
     }
-    ((planner, arguments),) = calls.pop("plan")
-    assert planner is policy
-    planned = (jax.random.key(0), problem, belief, seen)
-    assert policies._plan._call_key((policy, *arguments), {}) == policies._plan._call_key((policy, *planned), {})
+    expected["plan"] = policy.programs(jax.random.key(1), problem, belief, seen)
 
     def keys(each):
         return {name: [(f, f._call_key(args, {})) for f, args in pairs] for name, pairs in each.items()}
 
     assert keys(calls) == keys(expected)
+
+
+def test_a_plan_for_a_found_target_compiles_little_more_than_one_for_a_hidden_one(problem):
+    policy, seen, key = search_for_grasp(), preparing.nothing_seen(), jax.random.key(0)
+    hidden = initial_belief(problem)
+    beliefs = hidden, hidden.replace(found=jnp.array(True))
+    kept, own = [], []
+    for (a, for_a), (b, for_b) in zip(*(policy.programs(key, problem, each, seen) for each in beliefs), strict=True):
+        (kept if a._call_key(for_a, {}) == b._call_key(for_b, {}) else own).append(a.__name__)
+    assert kept == ["first_draws", "candidates_of"]
+    assert own == ["_begun", "_decided", "_weights"]
+
+
+@pytest.mark.parametrize("is_found", [False, True])
+def test_what_passes_between_the_parts_of_a_plan_has_the_shapes_that_are_compiled_for(problem, is_found):
+    policy, seen = search_for_grasp(), preparing.nothing_seen()
+    belief = initial_belief(problem).replace(found=jnp.array(is_found))
+    problem, belief = policy._planned_with(problem, belief)
+    key = jax.random.key(0)
+
+    def begun(problem, belief, key, objects):
+        rollout = policy.rollout(problem, belief)
+        begun = begin(rollout, key, objects)
+        root = begun.state.replace(candidates=rollout.candidates(begun.state))
+        return begun.replace(state=root), rollout.weights(root)
+
+    parts = jax.eval_shape(begun, problem, belief, key, seen.objects)
+    assert parts == shapes_of_parts(policy.rollout(problem, belief), key, seen.objects)[:2]
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_where_no_action_gains_anything_it_looks_one_farther(problem):
     assert "cost 9, 9 expected afterwards, 4 after what it makes possible" in step.reason
     assert step.to_json()["least_cost"] == 4.0
     assert policy.farther.farther.config.horizon == 3
-    assert policy.replace(propose=len).farther.propose is len
+    assert policy.replace(weigh=len).farther.weigh is len
 
 
 def test_what_blocks_a_target_in_sight_is_named(problem):

@@ -22,7 +22,6 @@ from mechsearch_jax.existence import occluders
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import PlannerConfig, PlanningPolicy, search_and_grasp
 from mechsearch_jax.planner.objective import Objective
-from mechsearch_jax.planner.proposal import WeightedDraw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
 from mechsearch_jax.problem.problem import Problem
@@ -68,10 +67,6 @@ def occlusion_weights(
     return weights_in_order(occlusion(problem, belief, state).by_object)
 
 
-# The `Propose` of this baseline.
-draw_by_occlusion = WeightedDraw(occlusion_weights)
-
-
 def most_occluding_first(
     kind: Int[Array, " s"], index: Int[Array, " s"], by_object: Float[Array, " n"]
 ) -> Float[Array, " s"]:
@@ -97,7 +92,7 @@ def plan_by_occlusion(rollout: Rollout, key: Array, objects: Superquadrics) -> D
     decrease by what the object occludes.
 
     Args:
-      rollout: problem, belief and slots; its propose draws in the same order.
+      rollout: problem, belief and slots; its `weigh` has the same order.
       key: PRNG key of the planner.
       objects: the recognised objects, fields (N, ...).
 
@@ -154,4 +149,4 @@ def most_occluding(config: PlannerConfig | None = None, **slots: Any) -> Plannin
         crowding_weight=0.0,
         unseen_contact_penalty=0.0,
     )
-    return search_and_grasp(plain, propose=draw_by_occlusion, **slots).replace(plan=plan_by_occlusion)
+    return search_and_grasp(plain, weigh=occlusion_weights, **slots).replace(plan=plan_by_occlusion)

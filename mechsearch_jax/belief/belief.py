@@ -169,14 +169,20 @@ def without_candidates(problem: Problem, belief: Belief) -> tuple[Problem, Belie
 
     f is 0 at all of them then, and g counts at the found pose alone: without them, nothing is computed for them.
     """
+    return problem_without_candidates(problem), _none(belief, "exists", "allowed")
 
-    def none(table: Any, *names: str) -> Any:
-        rows = ((name, getattr(table, name)) for name in names)
-        return table.replace(**{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in rows})
 
-    existence = none(problem.existence, "T_world_target", "depth", "corner", "middle", "nearest")
-    grasps = none(problem.grasps, "T_world_target", "pair_pose", "pair_grasp", "pair_valid", "pose_pairs")
-    return problem.replace(existence=existence, grasps=grasps), none(belief, "exists", "allowed")
+def problem_without_candidates(problem: Problem) -> Problem:
+    """A problem without what has a row for each candidate pose, other than the poses themselves."""
+    existence = _none(problem.existence, "T_world_target", "depth", "corner", "middle", "nearest")
+    grasps = _none(problem.grasps, "T_world_target", "pair_pose", "pair_grasp", "pair_valid", "pose_pairs")
+    return problem.replace(existence=existence, grasps=grasps)
+
+
+def _none(table: Any, *names: str) -> Any:
+    """A table without the rows of some of its arrays."""
+    rows = ((name, getattr(table, name)) for name in names)
+    return table.replace(**{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in rows})
 
 
 def possible_poses(

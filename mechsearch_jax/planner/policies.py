@@ -9,14 +9,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
@@ -25,14 +25,27 @@ from mechsearch_jax.belief.belief import Belief, possible_space, without_candida
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.geometry.masked import on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
-from mechsearch_jax.planner.proposal import Propose, farther_draw, guided_draw
-from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
-from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.planner.proposal import ObjectWeights, Propose, farther_weights, sampling_weights, weighted_draw
+from mechsearch_jax.planner.rollout import (
+    Begun,
+    Drawn,
+    Rollout,
+    begin,
+    candidates_of,
+    decide,
+    first_draws,
+    no_sequences,
+    plan,
+    shapes_of_parts,
+    without_poses,
+)
+from mechsearch_jax.planner.state import Decision, State
 from mechsearch_jax.planner.trials import concatenate, grasps_to_try, sequences_to_try
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.compiled import CachedJit, cached_jit
@@ -95,7 +108,7 @@ class PlanningPolicy(PyTreeNode):
 
     Attributes:
       config: settings of the planner.
-      propose, predict, objective: the slots; static.
+      weigh, predict, objective, propose: the slots; static.
       plan: plans with the slots; static.
       tries: whether decisions hold alternatives for trials; static. The action does not depend on it: a grasp must hit
         nothing. But `cost` and `sequences` are then those of the plan, for where no grasp succeeds in its trial.
@@ -103,15 +116,16 @@ class PlanningPolicy(PyTreeNode):
     """
 
     config: PlannerConfig
-    propose: Propose = static()
+    weigh: ObjectWeights = static()
     predict: Predict = static()
     objective: Objective = static()
+    propose: Propose = static(default=weighted_draw)
     plan: Plan = static(default=plan)
     tries: bool = static(default=False)
 
     def rollout(self, problem: Problem, belief: Belief) -> Rollout:
         """The engine with this policy's slots."""
-        return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective)
+        return Rollout(problem, belief, self.config, self.weigh, self.predict, self.objective, self.propose)
 
     @property
     def grasps(self) -> CachedJit:
@@ -122,8 +136,8 @@ class PlanningPolicy(PyTreeNode):
     def farther(self) -> PlanningPolicy:
         """The policy for where no action gains anything: it looks one action farther ahead, and draws guided by what
         is in the way of any action on an object, though others are possible. A program of its own."""
-        propose = farther_draw if self.propose == guided_draw else self.propose
-        return self.replace(config=dataclasses.replace(self.config, horizon=self.config.horizon + 1), propose=propose)
+        weigh = farther_weights if self.weigh is sampling_weights else self.weigh
+        return self.replace(config=dataclasses.replace(self.config, horizon=self.config.horizon + 1), weigh=weigh)
 
     @property
     def _planning(self) -> PlanningPolicy:
@@ -139,17 +153,31 @@ class PlanningPolicy(PyTreeNode):
             return problem, without_grasps(belief)
         return (problem, belief) if self.config.move_target else without_candidates(problem, belief)
 
-    @in_own_settings
-    def begin(
-        self, key: Array, problem: Problem, belief: Belief, observation: Observation
-    ) -> Callable[[], None] | None:
-        """Lower the plan for such arguments without planning; see `runtime.compiled.CachedJit.begin`."""
-        return _plan.begin(self._planning, key, *self._planned_with(problem, belief), observation)
+    @property
+    def _in_parts(self) -> bool:
+        """Whether a plan is several programs, of which those that take longest to compile are the same for a hidden and
+        for a found target. On a GPU, where starting programs costs more, it is one."""
+        return self.plan is plan and on_cpu()
 
     @in_own_settings
-    def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
-        """Whether the plan for such arguments is compiled; see `runtime.compiled.CachedJit.is_ready`."""
-        return _plan.is_ready(self._planning, key, *self._planned_with(problem, belief), observation)
+    def programs(
+        self, key: Array, problem: Problem, belief: Belief, observation: Observation
+    ) -> list[tuple[CachedJit, tuple[Any, ...]]]:
+        """The programs of a plan and their arguments, of which some are shapes, the longest first."""
+        policy, (problem, belief) = self._planning, self._planned_with(problem, belief)
+        observation = observation.with_boxes()
+        if not self._in_parts:
+            return [(_plan, (policy, key, problem, belief, observation))]
+        rollout = policy.rollout(problem, belief)
+        begun, weights, drawn = shapes_of_parts(rollout, key, observation.objects)
+        root = begun.state
+        return [
+            (first_draws, rollout.drawing(root, begun, weights)),
+            (candidates_of, (*without_poses(problem, root), begun.possible)),
+            (_begun, (policy, key, problem, belief, observation)),
+            (_decided, (policy, problem, belief, root, begun.later, drawn)),
+            (_weights, (policy, problem, belief, root)),
+        ]
 
     @in_own_settings
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
@@ -198,7 +226,8 @@ class PlanningPolicy(PyTreeNode):
           key, problem, belief, observation: as of a `Policy`.
         """
         observation = observation.with_boxes()
-        decision = _plan(self._planning, key, *self._planned_with(problem, belief), observation)
+        run = _plan_in_parts if self._in_parts else _plan
+        decision = run(self._planning, key, *self._planned_with(problem, belief), observation)
         if not self.tries:
             return decision
         reached = np.float32(self.objective.reached)
@@ -220,6 +249,34 @@ def _space(problem: Problem, belief: Belief) -> PossibleSpace:
 @cached_jit()
 def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
     return policy.plan(policy.rollout(problem, belief), key, observation.objects)
+
+
+def _plan_in_parts(
+    policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation
+) -> Decision:
+    """`rollout.plan`, of several programs."""
+    begun = _begun(policy, key, problem, belief, observation)
+    root = begun.state.replace(candidates=candidates_of(*without_poses(problem, begun.state), begun.possible))
+    weights = _weights(policy, problem, belief, root)
+    drawn = first_draws(*policy.rollout(problem, belief).drawing(root, begun, weights))
+    return _decided(policy, problem, belief, root, begun.later, drawn)
+
+
+@cached_jit()
+def _begun(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Begun:
+    return begin(policy.rollout(problem, belief), key, observation.objects)
+
+
+@cached_jit()
+def _weights(policy: PlanningPolicy, problem: Problem, belief: Belief, root: State) -> Float[Array, " n"]:
+    return policy.rollout(problem, belief).weights(root)
+
+
+@cached_jit()
+def _decided(
+    policy: PlanningPolicy, problem: Problem, belief: Belief, root: State, later: Array, drawn: Drawn
+) -> Decision:
+    return decide(policy.rollout(problem, belief), root, later, drawn)
 
 
 @cached_jit()
@@ -262,7 +319,7 @@ def planning_policy(
     later_push_model: PushModel | None = None,
     tries: bool = False,
     objective: Objective,
-    propose: Propose = guided_draw,
+    weigh: ObjectWeights = sampling_weights,
     **changes: Any,
 ) -> PlanningPolicy:
     """The engine with slots; see `PolicyFactory` for the first arguments.
@@ -272,7 +329,7 @@ def planning_policy(
       push_model, later_push_model: predict pushes.
       tries: whether decisions hold alternatives for trials.
       objective: the cost that plans minimise.
-      propose: samples an action in a state.
+      weigh: weighs the objects of a state for the draws of actions.
       **changes: fields of `config` to replace.
 
     Raises:
@@ -281,7 +338,7 @@ def planning_policy(
     push_model = push_model or own_push_model("learned")
     config = dataclasses.replace(_planner_config(config), **changes)
     predict = PredictByKind(push_model, later_push_model or push_model)
-    return PlanningPolicy(config, propose, predict, objective, tries=tries)
+    return PlanningPolicy(config, weigh, predict, objective, tries=tries)
 
 
 # Minimises f and g together while it searches (equation 2).

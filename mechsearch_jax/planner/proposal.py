@@ -1,8 +1,7 @@
-"""Sampling of an action in a state: the engine's slot `propose`."""
+"""Sampling of an action in a state: the engine's slots `weigh` and `propose`."""
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Protocol
 
 import jax
@@ -11,7 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.candidates import sample_action
 from mechsearch_jax.actions.types import Sample
-from mechsearch_jax.belief.belief import Belief, possible_space
+from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.existence import occluders
 from mechsearch_jax.grasping.graspability import pairs
 from mechsearch_jax.planner.objective import Objective
@@ -26,6 +26,24 @@ DEPTH = 2
 EVEN = 9
 
 
+class ObjectWeights(Protocol):
+    """Weighs the objects of a state for the draws of actions: the engine's slot `weigh`; static under jit."""
+
+    def __call__(
+        self, problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
+    ) -> Float[Array, " n"]:
+        """Sampling weight of each object, at least 0.
+
+        Args:
+          problem: constants of the search.
+          belief: the belief at the start of the plan.
+          objective: the cost that the search minimises.
+          guided_fraction: see `PlannerConfig`.
+          state: the state in which to sample.
+        """
+        ...
+
+
 class Propose(Protocol):
     """Samples an action in a state; static under jit."""
 
@@ -33,67 +51,33 @@ class Propose(Protocol):
         self,
         key: Array,
         problem: Problem,
-        belief: Belief,
-        objective: Objective,
-        guided_fraction: Array | float,
         state: State,
+        possible: PossibleSpace,
+        weights: Float[Array, " n"],
         wanted: Bool[Array, ""],
     ) -> Sample:
         """One action, of kind NONE if none is possible.
 
         Args:
           key: PRNG key.
-          problem: constants of the search.
-          belief: the belief at the start of the plan.
-          objective: the cost that the search minimises.
-          guided_fraction: see `PlannerConfig`.
-          state: the state in which to sample.
+          problem, state: constants of the search, and the state in which to sample; see `rollout.without_poses`.
+          possible: where the target may be.
+          weights: sampling weight of each object.
           wanted: whether the action is used; if not, it is of kind NONE, and little is computed.
         """
         ...
 
 
-class ObjectWeights(Protocol):
-    """Weighs the objects of a state for the draw of an action; static under jit."""
-
-    def __call__(
-        self, problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
-    ) -> Float[Array, " n"]:
-        """Sampling weight of each object, at least 0; see `Propose` for the arguments."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
-class WeightedDraw:
-    """A `Propose`: draws go to objects by sampling weights.
-
-    Attributes:
-      weigh: computes the weights.
-    """
-
-    weigh: ObjectWeights
-
-    def __call__(
-        self,
-        key: Array,
-        problem: Problem,
-        belief: Belief,
-        objective: Objective,
-        guided_fraction: Array | float,
-        state: State,
-        wanted: Bool[Array, ""],
-    ) -> Sample:
-        """See `Propose`."""
-        return sample_action(
-            key,
-            problem.space,
-            state.scene,
-            possible_space(problem, belief, state.exists),
-            state.candidates,
-            state.able,
-            self.weigh(problem, belief, objective, guided_fraction, state),
-            wanted,
-        )
+def weighted_draw(
+    key: Array,
+    problem: Problem,
+    state: State,
+    possible: PossibleSpace,
+    weights: Float[Array, " n"],
+    wanted: Bool[Array, ""],
+) -> Sample:
+    """The default `Propose`: draws go to objects by their weights."""
+    return sample_action(key, problem.space, state.scene, possible, state.candidates, state.able, weights, wanted)
 
 
 def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Array, " n"]:
@@ -161,8 +145,3 @@ def farther_weights(
 ) -> Float[Array, " n"]:
     """`sampling_weights` for where no single action gains anything: not even of what can be moved already."""
     return sampling_weights(problem, belief, objective, guided_fraction, state, partly=True)
-
-
-# The default `Propose`: draws go to objects by `sampling_weights`; and the one that looks farther ahead.
-guided_draw = WeightedDraw(sampling_weights)
-farther_draw = WeightedDraw(farther_weights)

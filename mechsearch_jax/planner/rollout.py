@@ -1,7 +1,7 @@
 """The engine: sampling-based model predictive control over predicted states (paper sections 3 and 4.4, appendix B.4).
 
 All sequences of actions are sampled in one vmapped computation, each action in the predicted state of its step, and the
-first action of the best sequence is taken. Sampling, prediction and the cost are slots.
+first action of the best sequence is taken. What draws go to, sampling, prediction and the cost are slots.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, con
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action, Prediction, Sample
-from mechsearch_jax.belief.belief import Belief, possible_space, with_target
+from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.belief.belief import Belief, possible_space, problem_without_candidates, with_target
 from mechsearch_jax.belief.moved_target import candidate_of
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.existence import existence, no_views, object_views
@@ -29,14 +30,18 @@ from mechsearch_jax.grasping.graspability import grasp_hits, no_hits, pairs, spl
 from mechsearch_jax.grasping.retrieval import found_hits
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
-from mechsearch_jax.planner.proposal import Propose
+from mechsearch_jax.planner.proposal import ObjectWeights, Propose, weighted_draw
 from mechsearch_jax.planner.state import Decision, Sequences, State
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.compiled import cached_jit
+from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Least decrease of J, as a share of J, that counts as a gain.
 GAIN = 0.02
 # Draws an action and predicts it, given the number of the draw and whether it counts.
 Attempt = Callable[[Array, Array], tuple[Sample, Prediction]]
+# The number of attempts so far, and the last one.
+Drawing = tuple[Array, tuple[Sample, Prediction]]
 # Fields of a state that an action changes, or that are then computed for the next one.
 CHANGING = ("scene", "target_at", "moved", "available", "alive", "candidates")
 
@@ -100,6 +105,89 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
     )
 
 
+def without_poses(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Problem and state without what has a row for each candidate pose or grasp of the target.
+
+    Candidate actions, draws and predictions do not need it, so that their programs are the same for a hidden and for a
+    found target.
+    """
+    return problem_without_candidates(problem), state.replace(exists=None, target_at=None, views=None, hits=None)
+
+
+class Drawn(PyTreeNode):
+    """An action that was drawn in a state, and what it is predicted to do.
+
+    Attributes:
+      action: of kind NONE if none is possible.
+      prediction: its effect.
+      contact: see `contact_probability`, shape (2,).
+    """
+
+    action: Action
+    prediction: Prediction
+    contact: jax.Array
+
+
+@cached_jit()
+def candidates_of(problem: Problem, state: State, possible: PossibleSpace) -> AllCandidates:
+    """Candidate actions of a state, brought up to date after `state.moved` moved; see `without_poses`."""
+    return all_candidates(problem.space, state.scene, possible, state.candidates, state.moved, state.able)
+
+
+def draw(
+    propose: Propose,
+    predict: Predict,
+    first: bool,
+    draws: int,
+    problem: Problem,
+    state: State,
+    possible: PossibleSpace,
+    weights: Float[Array, " n"],
+    key: Array,
+) -> Drawn:
+    """An action and its prediction, drawn again until it is possible, at most `draws` times.
+
+    Args:
+      propose, predict: the slots.
+      first: whether it is the first of its sequence.
+      draws: the most draws.
+      problem, state: see `without_poses`.
+      possible: where the target may be.
+      weights: sampling weight of each object.
+      key: PRNG key.
+    """
+
+    def sampled(i, wanted):
+        return propose(jax.random.fold_in(key, i), problem, state, possible, weights, wanted)
+
+    def attempt(i, wanted):
+        sample = sampled(i, wanted)
+        return sample, predict(problem, state, sample, first)
+
+    if draws == 1:
+        sample, prediction = attempt(jnp.int32(0), state.alive)
+    else:
+        start = _nothing_drawn(sampled, state, key)
+        sample, prediction = (_draw_one_by_one if on_cpu() else _draw_all)(attempt, start, state, draws)
+    contact = contact_probability(problem.space, state.scene, possible, sample)
+    return Drawn(sample.action, prediction, contact)
+
+
+@cached_jit(static_argnames=("propose", "predict", "draws"))
+def first_draws(
+    propose: Propose,
+    predict: Predict,
+    draws: int,
+    problem: Problem,
+    state: State,
+    possible: PossibleSpace,
+    weights: Float[Array, " n"],
+    keys: Array,
+) -> Drawn:
+    """`draw` of the first action of sequences, one for each key, fields (S, ...)."""
+    return jax.vmap(functools.partial(draw, propose, predict, True, draws, problem, state, possible, weights))(keys)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rollout:
     """The model of a decision: what all its states share, and the step from one state to the next.
@@ -107,15 +195,16 @@ class Rollout:
     Attributes:
       problem, belief: constants of the search, and the present belief.
       config: settings of the planner.
-      propose, predict, objective: the slots.
+      weigh, predict, objective, propose: the slots.
     """
 
     problem: Problem
     belief: Belief
     config: PlannerConfig
-    propose: Propose
+    weigh: ObjectWeights
     predict: Predict
     objective: Objective
+    propose: Propose = weighted_draw
 
     def root(self, objects: Superquadrics) -> State:
         """`present_state` of the rollout's problem and belief."""
@@ -147,10 +236,22 @@ class Rollout:
         hits_at_found = found_hits(problem.target_grasps, grasps, objects, at_found_pose, state.hits[rows:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, hits_at_found]))
 
+    def possible(self, state: State) -> PossibleSpace:
+        """Where the target may be in a state."""
+        return possible_space(self.problem, self.belief, state.exists)
+
     def candidates(self, state: State) -> AllCandidates:
         """Candidate actions of a state, brought up to date after `state.moved` moved."""
-        possible = possible_space(self.problem, self.belief, state.exists)
-        return all_candidates(self.problem.space, state.scene, possible, state.candidates, state.moved, state.able)
+        return candidates_of(*without_poses(self.problem, state), self.possible(state))
+
+    def weights(self, state: State) -> Float[Array, " n"]:
+        """Sampling weight of each object in a state that is up to date."""
+        return self.weigh(self.problem, self.belief, self.objective, self.config.guided_fraction, state)
+
+    def drawing(self, root: State, begun: Begun, weights: Any) -> tuple[Any, ...]:
+        """The arguments of `first_draws` in a state that is up to date, or their shapes."""
+        bare = without_poses(self.problem, root)
+        return self.propose, self.predict, self.config.draws[0], *bare, begun.possible, weights, begun.keys
 
     def up_to_date(self, state: State) -> State:
         """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
@@ -161,20 +262,6 @@ class Rollout:
         """J of a state that is up to date."""
         return self.objective.cost(self.problem, self.belief, state, self.config.weights)
 
-    def _draw(self, first: bool, state: State, key: Array) -> tuple[Sample, Prediction]:
-        """An action and its prediction, drawn again until it is possible, at most as often as `config` allows."""
-
-        def attempt(i, wanted):
-            draw = jax.random.fold_in(key, i)
-            guided = self.config.guided_fraction
-            sample = self.propose(draw, self.problem, self.belief, self.objective, guided, state, wanted)
-            return sample, self.predict(self.problem, state, sample, first)
-
-        draws = self.config.draws[0 if first else 1]
-        if draws == 1:
-            return attempt(jnp.int32(0), state.alive)
-        return (_draw_one_by_one if on_cpu() else _draw_all)(attempt, state, key, draws)
-
     def act(self, first: bool, state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
         """Sample an action in a state: the predicted changes, the action, and its penalties as shares of J, (2,).
 
@@ -183,9 +270,16 @@ class Rollout:
           state: up to date.
           key: PRNG key.
         """
-        sample, prediction = self._draw(first, state, key)
+        draws = self.config.draws[0 if first else 1]
+        bare = without_poses(self.problem, state)
+        drawn = draw(self.propose, self.predict, first, draws, *bare, self.possible(state), self.weights(state), key)
+        return self.outcome(state, drawn)
+
+    def outcome(self, state: State, drawn: Drawn) -> tuple[dict[str, Any], Action, Array]:
+        """What a drawn action changes in a state, the action, and its penalties as shares of J, (2,)."""
+        prediction = drawn.prediction
         acted = prediction.possible & state.alive
-        action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
+        action = drawn.action.replace(kind=jnp.where(acted, drawn.action.kind, ActionKind.NONE).astype(jnp.int32))
         spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.as_in_paper)
         moved = prediction.moved & acted
         target_at = state.target_at
@@ -199,14 +293,7 @@ class Rollout:
             "available": state.available & ~spent,
             "alive": acted,
         }
-        return changes, action, self.config.unseen_contact_penalty * self.contact_probability(state, sample)
-
-    def contact_probability(self, state: State, sample: Sample) -> Float[Array, "2"]:
-        """Share of the possible poses at which an action would touch the target, where it was drawn; and whether it
-        enters space that was not measured.
-        """
-        possible = possible_space(self.problem, self.belief, state.exists)
-        return contact_probability(self.problem.space, state.scene, possible, sample)
+        return changes, action, self.config.unseen_contact_penalty * drawn.contact
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """Advance sequences that have begun by one action: the states after it, and records of the states before it."""
@@ -229,7 +316,7 @@ class Rollout:
         return states.replace(**changes), kept
 
 
-def _draw_one_by_one(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[Sample, Prediction]:
+def _draw_one_by_one(attempt: Attempt, start: Drawing, state: State, draws: int) -> tuple[Sample, Prediction]:
     """The first possible attempt, without computing later ones: fastest on a CPU."""
 
     def again(carry):
@@ -241,10 +328,10 @@ def _draw_one_by_one(attempt: Attempt, state: State, key: Array, draws: int) -> 
         i, (_, prediction) = carry
         return (i < draws) & ~prediction.possible & state.alive
 
-    return jax.lax.while_loop(goes_on, again, _begin(attempt, state, key))[1]
+    return jax.lax.while_loop(goes_on, again, start)[1]
 
 
-def _draw_all(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[Sample, Prediction]:
+def _draw_all(attempt: Attempt, start: Drawing, state: State, draws: int) -> tuple[Sample, Prediction]:
     """The first possible attempt in two rounds, the first attempt and then all others: fastest on a GPU."""
     others = jnp.arange(draws - 1, dtype=jnp.int32)
 
@@ -260,12 +347,12 @@ def _draw_all(attempt: Attempt, state: State, key: Array, draws: int) -> tuple[S
         turn, (_, prediction) = carry
         return (turn < 2) & ~prediction.possible & state.alive
 
-    return jax.lax.while_loop(goes_on, again, _begin(attempt, state, key))[1]
+    return jax.lax.while_loop(goes_on, again, start)[1]
 
 
-def _begin(attempt: Attempt, state: State, key: Array) -> tuple[Array, tuple[Sample, Prediction]]:
+def _nothing_drawn(sampled: Callable[[Array, Array], Sample], state: State, key: Array) -> Drawing:
     """What loops over attempts begin with: no attempt yet."""
-    shapes = jax.eval_shape(lambda: attempt(jnp.int32(0), state.alive)[0])
+    shapes = jax.eval_shape(lambda: sampled(jnp.int32(0), state.alive))
     blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
     # All that changes varies with the key from the beginning: JAX would trace the loop once more to find that it does.
@@ -284,6 +371,33 @@ def repeated(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), tree)
 
 
+class Begun(PyTreeNode):
+    """What the draws of first actions begin with.
+
+    Attributes:
+      state: the present one, with f and g; its candidate actions come next.
+      possible: where the target may be.
+      keys, later: of the first actions, shape (S,), and of what follows, shape (M, S).
+    """
+
+    state: State
+    possible: PossibleSpace
+    keys: jax.Array
+    later: jax.Array
+
+
+def begin(rollout: Rollout, key: Array, objects: Superquadrics) -> Begun:
+    """The first part of `plan`: all sequences begin in the same state, which is computed once."""
+    root = rollout.update(rollout.root(objects))
+    return Begun(root, rollout.possible(root), *_keys(rollout.config, key))
+
+
+def _keys(config: PlannerConfig, key: Array) -> tuple[Array, Array]:
+    keys = jax.vmap(lambda k: jax.random.split(k, config.horizon + 1))(jax.random.split(key, config.sequences))
+    keys = jnp.swapaxes(keys, 0, 1)
+    return keys[0], keys[1:]
+
+
 def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     """Decide on the next action by sampling sequences and keeping the first action of the best (B.4).
 
@@ -295,12 +409,37 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     Returns:
       The decision. The same arguments give the same decision, also under `vmap`.
     """
+    begun = begin(rollout, key, objects)
+    root = begun.state.replace(candidates=rollout.candidates(begun.state))
+    drawn = first_draws(*rollout.drawing(root, begun, rollout.weights(root)))
+    return decide(rollout, root, begun.later, drawn)
+
+
+def shapes_of_parts(rollout: Rollout, key: Array, objects: Superquadrics) -> tuple[Any, Any, Any]:
+    """Shapes of what passes between the parts of `plan`, of which none is traced: begun, weights and drawn."""
+
+    def parts(problem: Problem, belief: Belief, key: Array, objects: Superquadrics) -> tuple[Begun, Array, Drawn]:
+        traced = dataclasses.replace(rollout, problem=problem, belief=belief)
+        root = traced.root(objects)
+        begun = Begun(root, traced.possible(root), *_keys(rollout.config, key))
+        drawn = Drawn(no_action(), Prediction(root.scene, root.moved, root.alive), jnp.zeros(2))
+        return begun, jnp.zeros(root.scene.capacity), repeated(drawn, rollout.config.sequences)
+
+    return jax.eval_shape(parts, rollout.problem, rollout.belief, key, objects)
+
+
+def decide(rollout: Rollout, root: State, later: Array, drawn: Drawn) -> Decision:
+    """The last part of `plan`: what the drawn actions come to.
+
+    Args:
+      rollout: problem, belief and slots.
+      root: the present state, up to date.
+      later: see `Begun`.
+      drawn: the first action of each sequence, fields (S, ...).
+    """
     config = rollout.config
     count, horizon = config.sequences, config.horizon
-    keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
-    # All sequences begin in the same state, which is computed once.
-    root = rollout.up_to_date(rollout.root(objects))
-    changes, actions, penalty = jax.vmap(functools.partial(rollout.act, True, root))(keys[0])
+    changes, actions, penalty = jax.vmap(functools.partial(rollout.outcome, root))(drawn)
     scenes = changes["scene"]
     if horizon == 1:
         # Pushes are often drawn again: of equal actions only the first is looked at.
@@ -311,8 +450,8 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     else:
         states = repeated(root, count).replace(**changes)
         times = 1 + jnp.arange(horizon)
-        _, later = jax.lax.scan(lambda states, now: rollout.step(states, *now), states, (keys[1:], times))
-        later_actions, cost, later_penalty = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), later)
+        _, records = jax.lax.scan(lambda states, now: rollout.step(states, *now), states, (later, times))
+        later_actions, cost, later_penalty = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), records)
         actions, penalty = jax.tree.map(
             lambda a, b: jnp.concatenate([a[:, None], b[:, :-1]], axis=1),
             (actions, penalty),
@@ -322,7 +461,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     cost = jnp.concatenate([jnp.broadcast_to(now, (count, 1)), cost], axis=1)
     value, length = sequence_values(cost, penalty * cost[:, :-1, None], actions.kind != ActionKind.NONE, config.gamma)
     # Without the target's slot, the last.
-    after = jax.tree.map(lambda a: a[:, : objects.capacity], scenes)
+    after = jax.tree.map(lambda a: a[:, :-1], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)
     order = jnp.argsort(sequences.value, stable=True)
     sequences = jax.tree.map(lambda a: a[order], sequences)

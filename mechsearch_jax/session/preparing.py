@@ -19,6 +19,7 @@ import numpy as np
 
 from mechsearch_jax.actions import KINDS, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.images.labels import CAPACITY
 from mechsearch_jax.observation import Observation
@@ -69,6 +70,11 @@ def nothing_seen(parts: int | None = None, capacity: int = CAPACITY) -> Observat
     return jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
 
 
+def plan(policy: PlanningPolicy, key: jax.Array, problem: Problem, belief: Belief, seen: Observation) -> list[Program]:
+    """The programs of a plan, the longest first; see `decision`."""
+    return [program("plan", function, *args) for function, args in policy.programs(key, problem, belief, seen)]
+
+
 def decision(problem: Problem, policy: Policy, seen: Observation | None = None) -> list[Program]:
     """The programs of the first decision that take long to compile, the longest first.
 
@@ -79,7 +85,7 @@ def decision(problem: Problem, policy: Policy, seen: Observation | None = None) 
     belief, seen = initial_belief(problem), seen or nothing_seen()
     programs = []
     if isinstance(policy, PlanningPolicy):
-        programs.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
+        programs += plan(policy, jax.random.key(0), problem, belief, seen)
     return [*programs, program("belief", update_belief, problem, belief, seen, seen, no_action())]
 
 

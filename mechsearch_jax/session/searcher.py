@@ -53,7 +53,7 @@ from mechsearch_jax.runtime.own_settings import in_own_settings
 from mechsearch_jax.session import faults, warming
 from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.models import UNTRIED, policy_and_trials, tries_nothing
-from mechsearch_jax.session.preparing import Preparing, first_decision, nothing_seen, program
+from mechsearch_jax.session.preparing import Preparing, first_decision, nothing_seen, plan
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
 from mechsearch_jax.session.step import (
     TRIES,
@@ -246,7 +246,7 @@ class Searcher:
             if isinstance(self._policy, PlanningPolicy):
                 # Of a found target that cannot be taken out yet.
                 found = belief.replace(found=jax.numpy.array(True))
-                preparing.add([program("plan", self._policy, key, problem, found, visible)])
+                preparing.add(plan(self._policy, key, problem, found, visible))
             stage()
             twin = self._twin()
             searching = twin._step_on(hidden, images)
