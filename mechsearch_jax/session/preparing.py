@@ -97,11 +97,13 @@ def first_decision(
 
 
 def retrieval(problem: Problem, policy: Policy, seen: Observation | None = None) -> list[Program]:
-    """The programs of a decision about a found target that take long to compile, but for the plan; see `decision`."""
+    """The programs of a decision about a found target that take long to compile; see `decision`."""
     if not isinstance(policy, PlanningPolicy):
         return []
-    found_pose, seen = initial_belief(problem).found_pose, seen or nothing_seen()
-    return [program("grasp", policy.grasps, problem.target_grasps, seen.objects, found_pose)]
+    belief, seen = initial_belief(problem), seen or nothing_seen()
+    found = belief.replace(found=jax.numpy.array(True))
+    grasp = program("grasp", policy.grasps, problem.target_grasps, seen.objects, belief.found_pose)
+    return [grasp, *plan(policy, jax.random.key(0), problem, found, seen)]
 
 
 def motions(config: MotionConfig) -> list[Program]:
