@@ -1,23 +1,13 @@
 """Actions until a goal: what is counted by hand, what SciPy says of the same times, and the share of a gap."""
 
-import csv
 import dataclasses
-import functools
-import io
-import json
-import re
 
 import numpy as np
 import pytest
 import scipy.stats
-from rich.console import Console
 from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.report import report_bench
-from mechsearch_jax.benchmarks.report.episode_tables import restricted_table
-from mechsearch_jax.benchmarks.report.report import Report
-from mechsearch_jax.benchmarks.report.report_figures import success_figure
-from mechsearch_jax.benchmarks.report.report_files import write_report
 from mechsearch_jax.benchmarks.statistics.actions_until import (
     budget_of,
     horizon_of,
@@ -39,7 +29,6 @@ ROWS = [
     row_of("c2-8-000", **{**LOST, "found_step": None, "steps": 1, "failure": "the target fell over at action 1"}),
     row_of("c2-8-001", **{**LOST, "found_step": None, "steps": 0, "failure": "error: x"}),
 ]
-FOUND = functools.partial(restricted_steps, goal="found", budget=10)
 TWENTY = Method(config=PRESETS["standard"](max_steps=20))
 
 
@@ -104,17 +93,6 @@ def test_the_mean_is_the_area_above_the_curve_as_scipy_draws_it():
         assert float(np.sum(scipy.stats.ecdf(failed).sf.evaluate(np.arange(horizon, dtype=float)))) <= area + 1e-12
 
 
-def test_intervals_draw_scenes_and_not_episodes():
-    """Four seeds of a scene that end alike say no more than one."""
-    once = [row_of(f"c2-2-{i:03d}", found_step=i % 7) for i in range(40)]
-    again = [dataclasses.replace(row, seed=seed) for row in once for seed in range(4)]
-    (first, _), (second, _) = (restricted_means(rows, ["objects"]) for rows in (once, again))
-    assert first.found_interval == pytest.approx(second.found_interval)
-    rng, values = np.random.default_rng(1), np.array([i % 7 for i in range(40)], float)
-    drawn = values[rng.integers(0, 40, (20_000, 40))].mean(axis=1)
-    assert first.found_interval == pytest.approx(np.quantile(drawn, [0.025, 0.975]), abs=0.05)
-
-
 def times(name, steps, policy="greedy"):
     """Rows that are found after so many actions, on a scene each; never where that is None."""
     method = Method(policy)
@@ -131,30 +109,3 @@ def test_differences_count_pairs_that_never_got_there():
     ((_, goals),) = paired([*base, *other], label).items()
     assert (goals["found_steps"].pairs, goals["found_steps"].mean) == (1, 1.0)
     assert (goals["found_restricted_steps"].pairs, goals["found_restricted_steps"].mean) == (3, (1 + 6 - 7) / 3)
-
-
-def test_a_report_has_the_means_in_its_page_its_table_and_on_the_screen(tmp_path):
-    report = Report.of([dataclasses.replace(row, looks=None) for row in ROWS])
-    write_report(report, tmp_path)
-    text = re.sub(" +", " ", (tmp_path / "report.md").read_text())
-    assert "one that never gets there counts as 10, and until *retrieved*" in text
-    assert "| search-for-grasp | 2 | 2 | 2.50 (1.00 to 4.00) | 6.00 (2.00 to 10.00) | 7.00 (3.00 to 11.00) |" in text
-    with open(tmp_path / "actions.csv", newline="") as file:
-        last = list(csv.DictReader(file))[-1]
-    assert (last["objects"], last["budget"], last["found"], last["retrieved"]) == ("all", "10", "6.25", "9.0")
-    assert float(last["found_low"]) < 6.25 < float(last["found_high"])
-    assert json.loads((tmp_path / "rates.json").read_text())["actions"][-1]["graspable"] == 8.0
-    screen = Console(file=io.StringIO(), width=100)
-    screen.print(restricted_table(report.restricted, report.key))
-    printed = screen.file.getvalue()
-    assert "never counted as 10, or 11 for retrieved" in " ".join(printed.split())
-    assert printed.splitlines()[-1].split()[1:] == ["all", "4", "6.2", "8.0", "9.0"]
-
-
-def test_the_curves_of_all_objects_are_drawn_beside_those_of_each_number():
-    figure = success_figure(ROWS)
-    titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:3] == ["2 objects", "8 objects", "all"]
-    (line,) = figure.axes[2].get_lines()
-    assert line.get_ydata().tolist()[:5] == [0.0, 0.25, 0.25, 0.25, 0.5]
-    assert [axes.get_title() for axes in success_figure(ROWS[:2]).axes] == ["2 objects", "", ""]

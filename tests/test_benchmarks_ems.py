@@ -57,11 +57,6 @@ def test_jacobian_is_that_of_finite_differences():
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_full_clouds_are_recovered(name):
-    assert iou(*cloud(name, 0)) > 0.98
-
-
-@pytest.mark.parametrize("name", SHAPES)
 def test_outliers_and_noise_do_little_harm(name):
     assert iou(*cloud(name, 0, noise=0.001, outliers=30)) > 0.97
 
@@ -69,14 +64,6 @@ def test_outliers_and_noise_do_little_harm(name):
 @pytest.mark.parametrize("name", SHAPES)
 def test_clouds_seen_from_one_side_are_recovered(name):
     assert iou(*cloud(name, 0, partial=True)) > 0.97
-
-
-def test_recovery_moves_with_the_points():
-    points, _ = cloud("box", 0)
-    turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.1, 2.0, -1.0])
-    a, b = ems.recover(points), ems.recover(2.0 * points @ turn.T + shift)
-    np.testing.assert_allclose(np.sort(b.size), 2.0 * np.sort(a.size), rtol=0.03)
-    np.testing.assert_allclose(b.position, 2.0 * turn @ a.position + shift, atol=2e-3)
 
 
 def test_slots_without_points_are_absent():

@@ -9,7 +9,6 @@ from mechsearch_jax.benchmarks.statistics.intervals import (
     mean_intervals,
     share_interval,
     wilson,
-    with_interval,
 )
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
 
@@ -37,11 +36,6 @@ def coverage(interval, share, scenes, seeds, correlation):
 def test_an_interval_holds_the_true_share_as_often_as_it_says(share, scenes, seeds, correlation):
     # Of 2,000 draws a chance of 0.95 makes 0.94 to 0.96.
     assert 0.92 <= coverage(share_interval, share, scenes, seeds, correlation) <= 0.98
-
-
-def test_independent_episodes_would_say_more_than_they_hold():
-    """What share_interval is there to mend."""
-    assert coverage(lambda reached, names: wilson(sum(reached), len(reached)), 0.85, 25, 8, 0.3) < 0.8
 
 
 def test_where_each_scene_has_one_episode_it_is_wilsons():
@@ -128,9 +122,3 @@ def test_many_intervals_at_once_are_those_of_each_alone(monkeypatch):
     monkeypatch.setattr("mechsearch_jax.benchmarks.statistics.intervals.STACKED", 14)
     assert mean_intervals(samples) == alone
     assert mean_intervals([]) == []
-
-
-def test_a_value_stands_with_its_interval():
-    assert with_interval(0.5, (0.4, 0.6)) == "0.500 (0.400 to 0.600)"
-    assert with_interval(2, None, "{:+.1f}") == with_interval(2, (None, None), "{:+.1f}") == "+2.0"
-    assert with_interval(None, None) == "-"

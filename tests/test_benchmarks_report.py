@@ -14,7 +14,6 @@ from mechsearch_jax.benchmarks.report import report
 from mechsearch_jax.benchmarks.report.episode_tables import events_summary_table, summary_table
 from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
-from mechsearch_jax.benchmarks.statistics.actions_until import reached
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key
@@ -36,19 +35,6 @@ ROWS = [WON, LOST, BROKEN, OTHER]
 def page_of(folder):
     """The Markdown page of a report, in which one space is between cells."""
     return re.sub(" +", " ", (folder / "report.md").read_text())
-
-
-def test_goals_are_reached_once_and_for_all():
-    assert reached(ROWS, "found", 4) == [0, 3, 3, 3, 3]
-    assert reached(ROWS, "graspable", 4) == [0, 0, 2, 2, 2]
-    assert reached(ROWS, "retrieved", 4) == [0, 0, 0, 2, 2]
-
-
-def test_failures_are_counted_by_reason():
-    assert report.failures(ROWS) == [
-        report.Failures("search-for-grasp", "found, but not graspable", 1, 1 / 3),
-        report.Failures("search-for-grasp", "error: a | b\nc", 1, 1 / 3),
-    ]
 
 
 def test_a_report_holds_what_the_rows_say(tmp_path):
@@ -89,28 +75,6 @@ def test_the_actions_of_errors_do_not_count(tmp_path):
     screen = Console(file=io.StringIO(), width=100)
     screen.print(summary_table(summarise(ROWS), Key.of(ROWS)))
     assert [line.split()[-3] for line in screen.file.getvalue().splitlines()[-2:]] == ["-", "6.5"]
-
-
-def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
-    said = [dataclasses.replace(WON, paper_graspable=True, paper_graspable_step=2), LOST]
-    write_report([*said, dataclasses.replace(LOST, scenario="c", paper_graspable=False), OTHER], tmp_path)
-    text = page_of(tmp_path)
-    low, high = wilson(1, 2)
-    assert f"| 0.33 (0.06 to 0.79) | 0.50 ({low:.2f} to {high:.2f}) | 0.33 (0.06 to 0.79) |" in text
-    assert "| 1.00 (0.21 to 1.00) | - | 1.00 (0.21 to 1.00) |" in text
-    with open(tmp_path / "rates.csv", newline="") as file:
-        lines = [(line["paper_episodes"], line["paper_graspable"]) for line in csv.DictReader(file)]
-    assert lines == [("0", "")] * 2 + [("2", "0.5")] * 2
-    screen = Console(file=io.StringIO(), width=100)
-    rows = [*said, OTHER]
-    screen.print(summary_table(summarise(rows), Key.of(rows)))
-    assert [line.split()[4:7] for line in screen.file.getvalue().splitlines()[-1:]] == [["0.50", "1.00", "0.50"]]
-
-
-def test_a_report_of_one_success_has_no_failures(tmp_path):
-    write_report([WON], tmp_path)
-    assert "None did." in page_of(tmp_path)
-    assert (tmp_path / "failures.csv").read_text() == "method,reason,episodes,share\n"
 
 
 KNOWN = {
@@ -154,14 +118,6 @@ def test_a_report_says_what_happened_on_the_way(tmp_path):
     assert events_summary_table(summarise_events(rows), Key.of(rows)).row_count == 2
     unknown = [dataclasses.replace(row, truth_ruled_out=None) for row in rows]
     assert [events.texts()[2] for events in summarise_events(unknown)] == ["", ""]
-
-
-def test_rows_of_earlier_versions_have_no_events(tmp_path):
-    write_report(ROWS, tmp_path)
-    assert "These episodes do not say" in page_of(tmp_path)
-    assert (tmp_path / "events.csv").read_text().startswith("method,objects,episodes,truth_lost,")
-    assert json.loads((tmp_path / "rates.json").read_text())["events"] == []
-    assert not summarise_events(ROWS)
 
 
 def test_configurations_do_not_mix():

@@ -9,7 +9,6 @@ from mechsearch_jax.benchmarks.report import report_bench
 from mechsearch_jax.benchmarks.report.report import read_tables
 from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.benchmarks.store.rows import identity, write_rows
-from mechsearch_jax.runtime.errors import InputError
 
 
 def test_drawn_rows_are_those_of_a_sweep(tmp_path):
@@ -24,19 +23,6 @@ def test_drawn_rows_are_those_of_a_sweep(tmp_path):
     assert rows == report_bench.drawn_rows(len(rows), 0) != report_bench.drawn_rows(len(rows), 1)
 
 
-def test_drawn_episodes_reach_their_goals_in_turn():
-    rows = report_bench.drawn_rows(2000)
-    for row in rows:
-        steps = [step for step in (row.found_step, row.graspable_step) if step is not None]
-        assert sorted(steps) == steps
-        assert row.retrieved == (row.failure is None)
-        assert row.graspable_step is None or row.found_step is not None
-        assert not row.retrieved or row.graspable_step is not None
-        assert all(step <= row.steps <= report_bench.MOST_STEPS for step in steps)
-    assert 0.5 < sum(row.retrieved for row in rows) / len(rows) < 0.95
-    assert len({row.failure for row in rows if not row.retrieved}) >= len(report_bench.FAILURES)
-
-
 @pytest.mark.slow
 def test_the_command_reports_all_rows():
     begun = []
@@ -45,11 +31,3 @@ def test_the_command_reports_all_rows():
     assert [run["what"] for run in value["runs"]] == list(report_bench.REPORTS) == begun[1:]
     assert all(run["seconds"] > 0.5 and run["memory"] > 50 and run["bytes"] > 10_000 for run in value["runs"])
     assert report_bench.timings_table(value).row_count == 2
-
-
-@pytest.mark.slow
-@pytest.mark.always
-def test_a_report_that_fails_is_no_timing(tmp_path, capfd):
-    with pytest.raises(InputError, match="ended with status 2"):
-        report_bench.time_report("report", tmp_path / "none", tmp_path / "out")
-    assert "none" in capfd.readouterr().err

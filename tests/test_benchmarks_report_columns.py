@@ -5,7 +5,6 @@ import dataclasses
 import itertools
 import math
 import re
-from html.parser import HTMLParser
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,8 @@ from matplotlib import image
 from mechsearch_jax.benchmarks.pages.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report import films
 from mechsearch_jax.benchmarks.report.report import Report, ReportOptions
-from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figure, rates_figure, success_figure
-from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES, write_report
+from mechsearch_jax.benchmarks.report.report_figures import curve_figure
+from mechsearch_jax.benchmarks.report.report_files import write_report
 from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
@@ -163,38 +162,6 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     assert (by_seed.pairs, by_seed.scenes, by_seed.mean) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
 
 
-def test_a_report_says_which_scenes_were_chosen_on(tmp_path):
-    names = ("published-4-01", "development-box-4-003", "c2-8-089", "c2-8-090", "mine")
-    rows = [dataclasses.replace(WON, scenario=name) for name in names]
-    write_report(rows, tmp_path)
-    said = re.sub(" +", " ", (tmp_path / "report.md").read_text())
-    assert "3 of the 5 episodes are on scenes that settings were chosen on (the published ones," in said
-    write_report(rows[3:], tmp_path)
-    assert "chosen on" not in (tmp_path / "report.md").read_text()
-
-
-@pytest.mark.parametrize("variants", [2, 40])
-def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variants):
-    rows = rows_of(variants, lost=lambda variant, episode: (variant + episode) % 3 == 0)
-    report = Report.of(rows, ReportOptions(curve=["gamma", "guidance"], baseline="V03" if variants > 2 else "choice a"))
-    write_report(report, tmp_path)
-    for name in ("success.png", "rates.png", "curve.png"):
-        height, width = image.imread(tmp_path / name).shape[:2]
-        assert 250 < height < 1300
-        assert 500 < width < 2200
-    drawn = [line for axes in success_figure(rows, report.baseline).axes for line in axes.get_lines()]
-    named = {line.get_label(): line.get_color() for line in drawn if not line.get_label().startswith("_")}
-    assert len(named) == len(set(named.values())) <= len(COLOURS)
-    if variants > 2:
-        assert any(label.startswith("V03, ") for label in named)
-    ticks = rates_figure(report.variants, report.key).axes[-1].get_xticklabels()
-    assert {tick.get_text() for tick in ticks} == set(report.key.short.values())
-    assert {path.name for path in tmp_path.iterdir()} == {*FILES, *OPTIONAL_FILES}
-    # What the options no longer name does not stay.
-    write_report(rows, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == set(FILES)
-
-
 def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
     rows = rows_of(96, lost=lambda variant, episode: episode == variant % 3)
     write_report(Report.of(rows, ReportOptions(baseline="V01", paired=["scenario"])), tmp_path)
@@ -212,40 +179,6 @@ def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
         assert len(list(csv.DictReader(file))) == 96 * 3
     with open(tmp_path / "paired.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == 95 * 9
-
-
-class Checked(HTMLParser):
-    """Elements are closed in order, and nothing comes from elsewhere."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.seen, self.text = [], [], ""
-
-    def handle_starttag(self, tag, attributes):
-        assert all(value.startswith("data:image/png;base64,") for name, value in attributes if name in ("src", "href"))
-        self.seen.append(tag)
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text += data
-
-
-def test_the_page_holds_everything_and_what_is_said_is_no_markup(tmp_path):
-    broken = dataclasses.replace(LOST, scenario="b", failure="error: <b>5 & 6</b> $x_1$ a|b")
-    write_report([WON, broken, dataclasses.replace(WON, policy="my_lab:Mine", scenario="c")], tmp_path)
-    page = Checked()
-    page.feed((tmp_path / "report.html").read_text())
-    assert page.open == []
-    assert page.seen.count("img") == 2
-    assert "error: <b>5 & 6</b> $x_1$ a|b" in page.text
-    tex = (tmp_path / "report.tex").read_text()
-    assert r"error: \textless{}b\textgreater{}5 \& 6\textless{}/b\textgreater{} \$x\_1\$ a\textbar{}b" in tex
-    assert r"my\_lab:Mine & all & 1 & 0 &" in tex
-    assert "a\\|b" in (tmp_path / "report.md").read_text()
 
 
 def test_a_page_is_written_three_ways():

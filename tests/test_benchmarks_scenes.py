@@ -1,27 +1,21 @@
 """What scenes are like: counts against a brute-force count in the image, and figures that are those of the rows."""
 
 import dataclasses
-import json
-import statistics
 
 import numpy as np
 import pytest
-from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
+from stage import CYLINDER, HIDDEN, OPEN, TWO
 
 from mechsearch_jax.benchmarks.lab.parts import scenes
 from mechsearch_jax.benchmarks.lab.parts.exact_existence import exact_existence
-from mechsearch_jax.benchmarks.lab.parts.scenes import SceneRow, look_at_all, nearest_pose, save_scenes, summary
-from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.benchmarks.lab.parts.scenes import look_at_all, nearest_pose
 from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
-
-ROW = SceneRow("a", "one", "0123456789ab", 2, "cylinder", 40, 792, True, 0, 0.0, 2, 0.75)
 
 
 @pytest.fixture(scope="module")
@@ -89,16 +83,6 @@ def test_brute_force_finds_the_poses_at_which_the_image_shows_too_few_pixels_to_
                 assert min(np.hypot(*(np.array(b.position[:2]) - (x, y))) for b in scene.objects) < 0.12
 
 
-def test_rows_by_brute_force_say_how_much_larger_f_is():
-    exact = dataclasses.replace(ROW, exact_cells=32, exact_missed=1, exact_poses=20)
-    line = summary([exact, dataclasses.replace(exact, possible=30, exact_cells=30), ROW])[0]
-    assert line["exact_scenes"] == 2
-    assert line["possible_over_exact_cells"] == pytest.approx(70 / 62)
-    assert line["exact_cells_over_exact_poses"] == pytest.approx(62 / 40)
-    assert line["exact_missed_share"] == pytest.approx(2 / 62)
-    assert "exact_scenes" not in summary([ROW])[0]
-
-
 def test_the_nearest_pose_is_near_in_place_and_yaw():
     shelf = Shelf()
     for target in (Target.cylinder(), Target.box()):
@@ -109,54 +93,3 @@ def test_the_nearest_pose_is_near_in_place_and_yaw():
             shift = rng.uniform(-0.45, 0.45, 3) * cell
             turned = poses[index] + shift + [0.0, 0.0, np.pi * rng.integers(-2, 3)]
             assert nearest_pose(target, shelf, turned) == index
-
-
-def test_a_box_is_looked_at_with_its_own_poses(monkeypatch):
-    targets = []
-
-    class Stop(Exception):
-        pass
-
-    def refuse(target):
-        targets.append(target)
-        raise Stop
-
-    monkeypatch.setattr(scenes, "cached_problem", refuse)
-    boxed = dataclasses.replace(HIDDEN, target=dataclasses.replace(BOX, half_size=(0.015, 0.02, 0.05)))
-    with pytest.raises(Stop):
-        look_at_all({"boxes": [boxed]})
-    assert targets == [Target.box()]
-
-
-def test_figures_are_those_of_the_rows(tmp_path):
-    rows = [
-        ROW,
-        dataclasses.replace(
-            ROW, scenario="two", possible=80, target_pixels=60, target_share=0.02, truth_possible=False
-        ),
-        dataclasses.replace(ROW, scenario="three", possible=30, target_pixels=101, target_share=0.04, visible=1),
-        dataclasses.replace(ROW, scenario="four", objects=8, visible=7),
-        dataclasses.replace(ROW, source="other", scenario="five"),
-    ]
-    lines = summary(rows[::-1])
-    assert [(line["source"], line["objects"], line["scenes"]) for line in lines] == [
-        ("other", 2, 1), ("a", 2, 3), ("a", 8, 1),
-    ]  # fmt: skip
-    line = lines[1]
-    assert (line["possible_mean"], line["possible_median"]) == (50, 40)
-    assert line["possible_standard_error"] == pytest.approx(statistics.stdev([40, 80, 30]) / 3**0.5)
-    assert (line["possible_p10"], line["possible_p90"]) == pytest.approx((32, 72))
-    assert line["possible_share"] == pytest.approx(50 / 792)
-    assert [line[f"target_{name}"] for name in ("hidden", "below_threshold", "found")] == [1, 1, 1]
-    assert (line["truth_ruled_out"], line["target_share_mean"]) == (1, pytest.approx(0.02))
-    assert (line["visible_mean"], line["objects_share_mean"]) == (pytest.approx(5 / 3), 0.75)
-    assert lines[0]["possible_standard_error"] is None
-
-    save_scenes(rows, tmp_path / "scenes.json")
-    value = json.loads((tmp_path / "scenes.json").read_text())
-    assert value["summary"] == summary(rows)
-    assert [SceneRow(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
-    assert "jax" in value["versions"]
-    assert value["code"] == present_code()
-    with pytest.raises(InputError, match="there are no scenes"):
-        save_scenes([], tmp_path / "none.json")

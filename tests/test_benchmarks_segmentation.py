@@ -1,18 +1,12 @@
 """The measurement of segmentation: what counts, what is missed, what is written, and what the picture shows."""
 
-import dataclasses
-import json
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.lab.parts import images, segmentation
+from mechsearch_jax.benchmarks.lab.parts import images
 from mechsearch_jax.benchmarks.lab.parts.segmentation import SegmentationBench, overlaps, true_masks
-from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.viz.drawing import save_figure
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
@@ -58,36 +52,3 @@ def test_overlaps_are_those_of_a_plain_count():
     for i in range(TARGET):
         both, either = np.sum((segments == i) & (truth == i)), np.sum((segments == i) | (truth == i))
         assert iou[i] == pytest.approx(both / either) if (truth == i).any() else np.isnan(iou[i])
-
-
-def test_results_are_written_with_their_rows(perfect, tmp_path):
-    save_rows(perfect.value(), perfect.rows, tmp_path / "s.json")
-    value = json.loads((tmp_path / "s.json").read_text())
-    assert value["summary"] == perfect.summary()
-    rows = [segmentation.SegmentRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
-    assert rows == list(perfect.rows)
-
-
-def test_the_picture_shows_the_worst_images_first(wrong, tmp_path):
-    measured = wrong.run()
-    figure = segmentation.worst_figure(wrong, measured.rows, 5)
-    assert len(figure.subfigs) == 2
-    assert len(figure.axes) == 4
-    save_figure(figure, tmp_path / "worst.png")
-    assert (tmp_path / "worst.png").read_bytes().startswith(b"\x89PNG")
-    small = [dataclasses.replace(row, pixels=99) for row in measured.rows]
-    with pytest.raises(InputError, match="no images to draw"):
-        segmentation.worst_figure(wrong, small, 5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"scenes": []}, "there are no scenes"),
-        ({"noises": ()}, "at least one noise"),
-        ({"noises": ("fog",)}, '"fog" is unknown'),
-    ],
-)
-def test_a_measurement_of_nothing_is_refused(wrong, message):
-    with pytest.raises(InputError, match=message):
-        SegmentationBench(**{"scenes": [SCENE], **wrong})

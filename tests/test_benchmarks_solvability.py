@@ -15,8 +15,6 @@ from stage import HIDDEN, OPEN, TWO
 from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks.lab.ceiling import solvability
 from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, read_outcomes, summary
-from mechsearch_jax.benchmarks.lab.screen import as_text
-from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.envs.episode.records import ActionRecord
@@ -24,7 +22,6 @@ from mechsearch_jax.envs.known_target.judgement import Judgement
 from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import load_scenario
 
 EPISODE = EpisodeRow(
@@ -73,23 +70,6 @@ def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_pa
     assert read_outcomes([]).of(TWO) == (0, 0)
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("{", "is not JSON"),
-        ("[]", "there are no episodes"),
-        ('{"runs": []}', "there are no episodes"),
-        ('{"runs": [{"episodes": [["a"]]}]}', "is no stored result"),
-        ('{"runs": [3]}', "is no stored result"),
-        ('{"runs": [{"episodes": [{"scenario": "a"}]}]}', "is no stored result"),
-    ],
-)
-def test_what_holds_no_episodes_is_refused(tmp_path, text, complaint):
-    (tmp_path / "stored.json").write_text(text)
-    with pytest.raises(InputError, match=rf"stored.json: .*{complaint}"):
-        read_outcomes([tmp_path / "stored.json"])
-
-
 @pytest.fixture
 def ceiling(tmp_path, monkeypatch):
     """Searches that come to what `answers` says of a scene; `ceiling.searched` tells which were searched."""
@@ -131,29 +111,6 @@ def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, mon
     other = Ceiling(tmp_path, KnownSearchConfig(rounds=4))
     assert other.settings != ceiling.settings
     assert ceiling.searched == ["two", "hidden", "hidden", "two"]
-
-
-def test_shares_are_those_of_the_rows(tmp_path):
-    row = CeilingRow("a", "00", 2, 4, 1, True)
-    rows = [
-        row,
-        dataclasses.replace(row, scenario="b", retrieved=0, actions=3, rounds=1, simulated=9, seconds=1.0),
-        dataclasses.replace(row, scenario="c", retrieved=0, solvable=False, reason="too tight"),
-        dataclasses.replace(row, scenario="d", objects=8),
-    ]
-    two, eight, everything = summary(rows)
-    assert (two["objects"], eight["objects"], everything["objects"]) == (2, 8, None)
-    assert (two["scenes"], two["solved_in_an_episode"], two["solved_by_the_search"]) == (3, 1, 1)
-    assert two["solvable"] == pytest.approx(2 / 3)
-    assert everything["solvable_interval"] == wilson(3, 4)
-    solvability.save_ceiling(rows, {"rounds": 3}, "mechsearch bench ceiling", tmp_path / "ceiling.json")
-    value = json.loads((tmp_path / "ceiling.json").read_text())
-    assert [CeilingRow(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
-    assert (value["command"], value["settings"]) == ("mechsearch bench ceiling", {"rounds": 3})
-    assert as_text(summary(rows)[:1]) == (
-        "objects 2, scenes 3, solved_in_an_episode 1, solved_by_the_search 1, solvable 0.6667, "
-        f"solvable_interval {two['solvable_interval'][0]:.4g} to {two['solvable_interval'][1]:.4g}"
-    )
 
 
 RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "ceiling-cpu.json"

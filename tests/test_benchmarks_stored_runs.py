@@ -1,19 +1,17 @@
 """Stored runs: folders become one small file of rows and one of lines, and what does not belong together is refused."""
 
 import dataclasses
-import json
-import random
 import sys
 
 import pytest
 from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.lab.site import store_run
-from mechsearch_jax.benchmarks.lab.site.store_run import OUTCOMES, run_of, scene_set_of
+from mechsearch_jax.benchmarks.lab.site.store_run import run_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.store.rows import episode_key
-from mechsearch_jax.benchmarks.store.runs import load_run, merged, started, stored_runs, write_run
+from mechsearch_jax.benchmarks.store.runs import merged, stored_runs
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
@@ -62,11 +60,6 @@ def test_an_error_reaches_nothing():
     assert run_of("x", [failed]).lines[0]["actions"] is None
 
 
-def test_what_a_row_does_not_say_is_no_share():
-    (line,) = run_of("x", [row_of("c2-4-100", objects_fallen=None)]).lines
-    assert {name for name in OUTCOMES if line[name] is None} == {"drop_free"}
-
-
 def test_parts_of_other_code_and_those_that_disagree_are_refused(tmp_path):
     one = write(tmp_path / "one", [row_of("c2-4-001")])
     other = write(tmp_path / "other", [row_of("c2-4-002", code="other code")])
@@ -87,22 +80,6 @@ def test_what_agrees_counts_once_and_an_error_gives_way(tmp_path):
     assert merged(folders) == [good]
 
 
-def test_the_day_is_that_of_the_first_shard(tmp_path):
-    folders = [write(tmp_path / day, [row_of("c2-4-001")], f"2026{day}T101112-host-abc") for day in ("1125", "1124")]
-    assert started(folders) == "2026-11-24"
-    assert started([write(tmp_path / "x", [row_of("c2-4-001")])]) is None
-
-
-def test_files_that_do_not_belong_together_are_refused(tmp_path):
-    run = run_of("x", [row_of("c2-4-001"), row_of("c2-4-002")])
-    write_run(run, tmp_path)
-    (tmp_path / "x.jsonl").write_text(json.dumps({**run.lines[0], "episodes": 1}) + "\n")
-    with pytest.raises(InputError, match=r"x\.jsonl: tells of 1 episodes, .*x\.parquet has 2"):
-        load_run(tmp_path, "x")
-    with pytest.raises(InputError, match="--name a/b"):
-        write_run(dataclasses.replace(run, name="a/b"), tmp_path)
-
-
 def test_every_preset_is_its_own_settings():
     for name, preset in PRESETS.items():
         options = {**Method(config=preset()).options(), "simulator": "MjxSimulator", "target": "box"}
@@ -111,43 +88,3 @@ def test_every_preset_is_its_own_settings():
     later = Method().options()
     del later["move_target"]
     assert settings_of(later) == ("standard", {})
-
-
-def test_scenes_are_of_sets():
-    names = ("c2-4-017", "development-box-8-001", "d1-003", "published-2-00", "elsewhere")
-    assert list(map(scene_set_of, names)) == ["c2", "development-box", "d1", "published", "elsewhere"]
-
-
-def test_twenty_thousand_rows_are_small(tmp_path):
-    draw = random.Random(0)
-    methods = [
-        Method(policy, PRESETS[preset](), recognition)
-        for policy in ("search-for-grasp", "search-and-grasp")
-        for preset in ("standard", "paper")
-        for recognition in ("oracle", "masks", "full")
-    ]
-    usual = [row_of("c2-4-001", method) for method in methods]
-    rows = [
-        dataclasses.replace(
-            row,
-            scenario=f"c2-{objects}-{number:03d}",
-            content_hash=f"{100_000 * objects + number:012x}",
-            objects=objects,
-            found_step=draw.randrange(9),
-            graspable_step=draw.randrange(9),
-            steps=draw.randrange(10),
-            retrieved=draw.random() < 0.9,
-            looks=draw.randrange(9),
-            objects_fallen=int(draw.random() < 0.05),
-            planning_seconds=draw.lognormvariate(0.0, 1.0),
-            simulation_seconds=draw.lognormvariate(0.0, 1.0),
-            compile_seconds=draw.random(),
-        )
-        for row in usual
-        for objects in (2, 4, 6, 8)
-        for number in range(360)
-    ]
-    files = write_run(run_of("large", rows), tmp_path)
-    assert len(rows) == 17_280
-    assert files[0].stat().st_size < 500_000
-    assert files[1].stat().st_size < 300_000

@@ -70,19 +70,6 @@ def test_a_second_process_traces_nothing(folder):
     jax.tree.map(np.testing.assert_array_equal, as_numbers(second), expected)
 
 
-def test_a_folder_that_is_named_again_has_nothing_loaded_anew(folder, monkeypatch):
-    function = another_process()
-    function(Camera(), VALUES)
-    loaded = []
-    monkeypatch.setattr(executables.Executables, "load", lambda *_: loaded.append("loaded"))
-    keep_in(folder)
-    function(Camera(), VALUES)
-    assert (TRACED, loaded) == (["scaled"], [])
-    keep_in(folder.parent / "another")
-    function(Camera(), VALUES)
-    assert TRACED == ["scaled", "scaled"]
-
-
 def test_the_digest_of_a_package_counts_folders_that_are_links(tmp_path, monkeypatch):
     source, package = tmp_path / "source", tmp_path / "linkedpackage"
     for folder in (source, package):
@@ -137,24 +124,11 @@ def test_other_code_versions_and_processors_are_other_entries(folder, monkeypatc
     assert TRACED == ["scaled"]
 
 
-def test_a_machine_is_identified_by_versions_flags_and_what_its_processor_can(monkeypatch):
-    before = executables._machine.__wrapped__()
-    assert jax.__version__ in before
-    assert executables.processor() in before
-    assert not os.path.exists("/proc/cpuinfo") or "flags=" in before or "Features=" in before
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-    assert executables._machine.__wrapped__() != before
-
-
 def test_settings_of_jax_are_other_entries(folder):
     another_process()(Camera(), VALUES)
     with jax.default_matmul_precision("highest"):
         assert not another_process().is_ready(Camera(), VALUES)
     assert another_process().is_ready(Camera(), VALUES)
-
-
-def test_the_code_that_counts_is_all_that_may_be_traced():
-    assert executables._source() == executables.source_digest((".py",), ("mechsearch_jax", "mechsearch_jax.envs"))
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "altered", "of another", "no executable"])
@@ -208,26 +182,6 @@ def test_what_is_prepared_in_memory_is_what_is_called():
     assert function.jitted._cache_size() == called
     expected = jax.jit(scaled, static_argnames="camera")(Camera(), values)
     jax.tree.map(np.testing.assert_array_equal, as_numbers(result), as_numbers(expected))
-
-
-def test_what_is_wrong_with_what_is_prepared_is_said_there_and_by_a_call():
-    def wrong(values):
-        raise ValueError("wrong")
-
-    function = CachedJit(wrong, on_disk=False)
-    for _ in range(2):
-        with pytest.raises(ValueError, match="wrong"):
-            function.begin(VALUES)
-    with pytest.raises(ValueError, match="wrong"):
-        function(VALUES)
-
-
-def test_what_depends_on_more_than_its_arguments_stays_out_of_the_folder(folder):
-    for factor in (2.0, 3.0):
-        function = CachedJit(lambda values, factor=factor: values * factor, on_disk=False)
-        function.prepare(VALUES)
-        assert float(function(VALUES)[0]) == factor
-    assert not folder.exists()
 
 
 def test_inside_of_transformations_it_is_a_jitted_function(folder):
@@ -286,25 +240,10 @@ def test_a_folder_that_others_may_write_to_is_not_read(folder):
     assert TRACED == ["scaled"]
 
 
-def test_a_folder_that_cannot_be_made_is_done_without(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    keep_in(tmp_path / "file" / "executables")
-    try:
-        assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
-    finally:
-        keep_in(None)
-
-
 def test_the_oldest_entries_give_way(folder, monkeypatch):
     monkeypatch.setattr(executables, "MOST_BYTES", 0)
     another_process()(Camera(), VALUES)
     assert not list(folder.iterdir())
-
-
-def test_an_option_that_xla_does_not_know_is_done_without(folder, monkeypatch):
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    monkeypatch.setattr(compiled, "CPU_OPTIONS", {"xla_of_another_version": True})
-    assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
 
 
 class Colour(compiled.CachedJit):

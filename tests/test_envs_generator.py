@@ -119,13 +119,6 @@ def test_what_is_graspable_alone_is_so_at_candidate_poses(target, allowed, grasp
         assert graspable(pose) == (tuple(pose) in good), pose
 
 
-@pytest.mark.slow
-def test_promises_on_50_seeds(made, target, allowed):
-    for seed in range(100, 150):
-        objects = 1 + seed % 8
-        check(made.generate(seed, objects), objects, target, allowed)
-
-
 def test_a_seed_means_one_scenario(made):
     first, other = made.generate(3, 4), made.generate(4, 4)
     assert ScenarioGenerator(made.target).generate(3, 4) == first

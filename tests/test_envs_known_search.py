@@ -15,7 +15,7 @@ from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.known_target import search as known_search
 from mechsearch_jax.envs.known_target.judgement import InFullView, Judgement, judge
-from mechsearch_jax.envs.known_target.search import Frontier, KnownSearchConfig, Node, in_turn
+from mechsearch_jax.envs.known_target.search import KnownSearchConfig
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
@@ -25,10 +25,8 @@ from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, best_gras
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Sequences
 from mechsearch_jax.planner.rollout import present_state
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
-START = jax.device_get(from_scenario(TWO))
 SEARCH = planner.planning_policy(objective=InFullView())
 
 
@@ -147,11 +145,6 @@ def test_actions_are_joined_until_the_target_is_out(search):
     assert (result.start.judgement.least, result.best.judgement.least) == (1, 0)
 
 
-def test_a_whole_sequence_is_executed_and_each_world_of_it_looked_at(search):
-    result = search(sequences((-0.5, LEFT, LEFT, push(1, y=0.05))), Toy())
-    assert (result.rounds, len(result.actions), result.simulated) == (1, 3, 4)
-
-
 def test_there_are_no_more_actions_than_allowed(search):
     for steps, solved in ((3, True), (2, False), (1, False)):
         result = search(sequences((-0.5, LEFT, LEFT, LEFT)), Toy(), max_steps=steps)
@@ -177,57 +170,6 @@ def test_retrievals_that_fail_are_counted_and_solve_nothing(search):
     assert result.actions is None
     assert set(result.retrievals) == {"the arm was held up"}
     assert result.best.graspable
-
-
-def test_what_cannot_be_acted_upon_ends_when_the_rounds_do(search):
-    result = search(sequences((np.inf, LEFT)), Toy())
-    assert (result.actions, result.rounds, result.simulated) == (None, 6, 0)
-
-
-def test_the_same_first_action_is_executed_once(search):
-    rows = ((-0.5, push(1, y=0.02)), (-0.4, push(1, y=0.02)), (-0.2, push(1, y=0.04)))
-    simulator = Toy()
-    search(sequences(*rows), simulator, rounds=1)
-    assert simulator.pushes == 2
-
-
-def node(y, cost, actions=0):
-    position = np.array(START.position)
-    position[0, 1] = y
-    judgement = Judgement(np.float32(cost), np.zeros(1, bool), np.zeros((1, 8), bool))
-    return Node(START.replace(position=position), (None,) * actions, judgement)
-
-
-def test_a_frontier_gives_the_most_promising_worlds_and_lets_others_have_their_turn():
-    frontier = Frontier()
-    start, good, alike = node(0.0, 2.0), node(0.1, 1.5, 1), node(0.105, 1.0, 1)
-    for one in (start, good, alike):
-        frontier.add(one)
-    assert frontier.nodes == [start, good]
-    assert [frontier.next(1)[0] is good for _ in range(5)] == [True, True, False, True, False]
-    shorter, longer = Frontier(), node(0.2, 2.0, 2)
-    for one in (longer, start):
-        shorter.add(one)
-    assert shorter.next(2) == [start, longer]
-
-
-def test_proposals_of_every_kind_have_their_turn():
-    here, there = node(0.0, 2.0), node(0.1, 2.0)
-
-    def proposal(where, body, expected):
-        action = jax.tree.map(lambda a: a[None], push(body, y=0.1))
-        return known_search._Proposal(where, expected, action, 1)
-
-    easy = [proposal(here, 0, 0.1 * i) for i in range(5)]
-    others = [proposal(here, 1, 3.0), proposal(there, 0, 2.0)]
-    assert in_turn([*easy[::-1], *others], 4) == [easy[0], others[1], others[0], easy[1]]
-    assert in_turn([], 4) == []
-
-
-def test_settings_that_try_nothing_are_refused():
-    for name in ("simulated", "worlds", "rounds", "grasps", "retrievals", "max_steps"):
-        with pytest.raises(InputError, match=f"{name} 0 must be at least 1"):
-            KnownSearchConfig(**{name: 0})
 
 
 def test_a_target_that_may_stand_hidden_costs_no_more_for_it(problem):

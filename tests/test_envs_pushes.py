@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.lab.parts.push import repeated
 from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs.pushing import pushes as generator
@@ -19,10 +18,9 @@ from mechsearch_jax.envs.pushing.push_portions import portions
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, from_scenario, superquadrics
-from mechsearch_jax.geometry import footprints, superquadric, transforms
+from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.networks.push import PushConfig
-from mechsearch_jax.networks.push_contacts import reach
-from mechsearch_jax.networks.push_geometry import NORMALS, push_start
+from mechsearch_jax.networks.push_geometry import push_start
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
@@ -36,7 +34,6 @@ from mechsearch_jax.train.push_scores import (
     no_motion,
     planar_turn,
     push_truth,
-    turn_error,
 )
 from mechsearch_jax.train.scenes import SceneConfig, random_world
 from mechsearch_jax.workspace.scenario import Body, Scenario
@@ -134,15 +131,6 @@ def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
     assert np.median(gaps) == pytest.approx(0.5 * sum(CONFIG.gap), abs=4e-3)
 
 
-@pytest.mark.slow
-def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
-    (world, action, possible), _ = drawn
-    empty = ~world.valid.any(axis=1)
-    assert empty.sum() > 5
-    assert not possible[empty].any()
-    assert (action.kind[empty] == ActionKind.NONE).all()
-
-
 # --- what becomes of it ----------------------------------------------------------------------------------------------
 
 
@@ -159,13 +147,6 @@ def test_objects_are_displaced_along_the_push(pushes):
     assert (along[upright] < length[upright] + 0.03).all()
     assert (along[upright] > -0.005).all()
     assert np.median((along / np.maximum(length - 0.01, 0.01))[upright]) == pytest.approx(1.0, abs=0.35)
-
-
-@pytest.mark.slow
-def test_the_wrist_that_a_push_was_made_with_is_kept(pushes):
-    assert pushes.q7.shape == (len(pushes.object),)
-    assert np.isin(pushes.q7, push_tables(CONFIG).q7[1]).all()
-    assert len(np.unique(pushes.q7)) > 1
 
 
 @pytest.mark.slow
@@ -191,15 +172,6 @@ def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
                 valid = pushes.before.valid[b]
                 np.testing.assert_array_equal(pushes.after.position[a][valid], pushes.before.position[b][valid])
     assert followed >= 3
-
-
-@pytest.mark.slow
-def test_the_same_key_gives_the_same_pushes(pushes):
-    again, other = simulated(0, 1), simulated(4, 1)
-    first = len(again.object)
-    for a, b in zip(jax.tree.leaves(pushes), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a[:first], b)
-    assert not np.isin(other.displacement[:, 1], again.displacement[:, 1]).any()
 
 
 def upright_world(kind, rotation):
@@ -282,12 +254,6 @@ def test_pushes_are_made_once_and_read_again(tmp_path):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("wrong", [{"pushes": 0}, {"worlds": 0}, {"rounds": 0}, {"seed": -1}])
-def test_impossible_generations_are_refused(wrong):
-    with pytest.raises(InputError):
-        Generation(**{"seed": 0, "pushes": 5, "worlds": 8, **wrong})
-
-
 # --- what is learnt and how it is scored -----------------------------------------------------------------------------
 
 
@@ -305,11 +271,6 @@ def test_average_precision_is_the_area_by_hand():
     assert average_precision(score, np.array([1, 0, 1, 0, 0], bool)) == pytest.approx((1 / 1 + 2 / 3) / 2)
     assert average_precision(np.ones(4), np.array([1, 0, 0, 1], bool)) == pytest.approx(0.5)
     assert np.isnan(average_precision(score, np.zeros(5, bool)))
-
-
-def test_a_turn_by_half_a_turn_is_no_error():
-    error = turn_error(jnp.float32([0.1, np.pi, 3.0]), jnp.float32([0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(error, [0.1, 0.0, 3.0 - np.pi], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -378,20 +339,6 @@ def test_poses_are_blurred_and_nothing_else(pushes):
     np.testing.assert_array_equal(exactly.prints.position, start.prints.position)
 
 
-@pytest.mark.slow
-def test_what_is_sampled_to_learn_from_is_blurred(pushes):
-    def sampled(blur):
-        task = dataclasses.replace(task_of(pushes), blur=blur)
-        return jax.jit(lambda key: task.sample(key, 32))(jax.random.key(0))
-
-    assert task_of(pushes).blur > 0
-    sharp, soft = sampled(0.0), sampled(1e-3)
-    for a, b in zip(jax.tree.leaves(sharp.truth), jax.tree.leaves(soft.truth), strict=True):
-        np.testing.assert_array_equal(a, b)
-    off = np.asarray(soft.start.prints.position - sharp.start.prints.position)
-    assert 8e-4 < off.std() < 1.2e-3
-
-
 def row_of_boxes(*gaps):
     """A push of the first of several boxes in a row along y, which moves by 5 cm; nothing becomes of the others.
 
@@ -431,30 +378,6 @@ def test_what_may_have_held_something_in_place_is_never_left_out(gaps, kept):
     there = left.valid[:, : len(kept)]
     np.testing.assert_array_equal(there.all(axis=0), kept)
     assert there.any(axis=0).all()
-
-
-@pytest.mark.slow
-def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
-    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
-    start, truth = task.start(on_device), push_truth(on_device)
-    count = len(pushes.object)
-    varied, kept = VARIED(jax.random.split(jax.random.key(1), count), start, truth)
-    moved = np.asarray(varied.faces - start.faces)
-    assert (moved > 0).any()
-    assert (moved < 0).any()
-    for push, wall in zip(*np.nonzero(moved), strict=True):
-        valid = np.asarray(kept.valid)[push]
-        assert not np.asarray(truth.toppled)[push][valid].any()
-        normal, face = NORMALS[wall], np.asarray(varied.faces)[push, wall]
-        for world in (pushes.before, pushes.after):
-            prints = footprints.footprints(superquadrics(jax.tree.map(lambda a, push=push: a[push], world)))
-            toward = reach(prints, jnp.broadcast_to(-jnp.asarray(normal)[None], prints.position.shape))
-            inside = np.asarray(prints.position) @ normal - np.asarray(toward) - face
-            # Those that lean end with other footprints than they began with.
-            assert (inside[valid & (np.asarray(start.tilt)[push] < 1e-3)] > 0).all()
-        if normal[0] <= 0:
-            hand = np.asarray(start.points)[push, :, :2]
-            assert (np.stack([hand, hand + np.asarray(start.displacement)[push]]) @ normal > face).all()
 
 
 @pytest.mark.slow

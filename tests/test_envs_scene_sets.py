@@ -209,36 +209,9 @@ def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, q
     assert scene_files([(block, 1)], tmp_path / "mine").files == [tmp_path / "mine" / "quick-001.json"]
 
 
-def test_several_processes_make_the_scenes_on_record_in_order(tmp_path, monkeypatch):
-    monkeypatch.setattr(scene_sets, "EACH", 1)
-    monkeypatch.setattr(scene_sets, "cores", lambda: 2)
-    block = find_set("c2").blocks[0]
-    made = scene_files([(block, 2), (block, 0), (block, 1)], tmp_path)
-    assert [file.name for file in made.files] == [f"{block.scene_name(i)}.json" for i in (2, 0, 1)]
-    assert [load_scenario(file).content_hash for file in made.files] == [recorded()[block.name][i] for i in (2, 0, 1)]
-
-
 def test_scenes_that_are_not_what_is_on_record_are_reported(tmp_path, quick):
     block, _, record = quick
     record[1] = "0123456789ab"
     files = scene_files([(block, i) for i in range(4)], tmp_path)
     assert files.strange == ["quick-001"]
     assert len(files.files) == 4
-
-
-def test_without_a_cache_files_are_there_while_the_process_is(monkeypatch, quick):
-    block, made, _ = quick
-    monkeypatch.setenv(kept_arrays.VARIABLE, "")
-    (file,) = scene_files([(block, 3)]).files
-    assert load_scenario(file).name == "quick-003"
-    assert scene_files([(block, 3)]).files == [file]
-    assert made == [3]
-
-
-def test_a_record_is_written_and_read(tmp_path, monkeypatch):
-    block = dataclasses.replace(SETS["d1"].blocks[0], scenes=2)
-    monkeypatch.setattr(scene_sets, "_EXPERIMENTS", (SETS["d1"]._replace(blocks=(block,)),))
-    monkeypatch.setattr(scene_sets, "_BLOCKS", {"d1": block})
-    scene_sets.record(path=tmp_path / "record.json")
-    monkeypatch.setattr(scene_sets, "RECORD", tmp_path / "record.json")
-    assert scene_sets.recorded.__wrapped__() == {"d1": recorded()["d1"][:2]}

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
-from test_envs_simulator import take_out as retrieval
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
@@ -21,7 +20,6 @@ from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
-from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.trials.order import in_order
@@ -29,7 +27,7 @@ from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.grasping.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
+from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.step import DRAWS, SearchState, decide
 from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, scenes_of
@@ -471,16 +469,6 @@ def test_what_becomes_of_a_simulation_that_diverges_is_not_known(problem):
     np.testing.assert_array_equal(world._data.qpos, before)
 
 
-def test_the_hand_of_the_problem_is_the_one_that_is_tried(problem, monkeypatch):
-    seen, at = objects_and_pose(problem, EDGE)
-    heard = []
-    monkeypatch.setattr(native, "reference_motion", lambda kind, action, config: heard.append(config.gripper))
-    other = problem.replace(gripper=dataclasses.replace(problem.gripper, approach=0.09))
-    for here in (problem, other):
-        assert results_of(MODEL, here, seen, at, False, stack(pushes()[2])).tolist() == [FAILED]
-    assert heard == [problem.gripper, other.gripper]
-
-
 def several(*scenes):
     """Scenes with hidden targets as `Trials` take them."""
     seen = stack(*scenes)
@@ -687,15 +675,3 @@ def test_what_is_not_touched_sleeps(problem):
     scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world_of(problem, EDGE)))
     # The arm alone is awake, before anything is touched.
     assert (scene._data.tree_asleep >= 0).tolist() == [False] + [True] * 9
-
-
-def test_names():
-    assert named_trials("none") is None
-    assert named_trials("physics") is named_trials("physics")
-    assert named_trials("physics") == MODEL
-    for refuse in (named_trials, lambda name: dataclasses.replace(Config(), trials=name)):
-        with pytest.raises(InputError, match='trials "guess" is unknown; use none, physics'):
-            refuse("guess")
-    # What is tried out is simulated as it is executed.
-    assert MODEL.simulation == NativeWorld().config
-    assert retrieval(pose(0.6, 0.0, 0.05)).kind == ActionKind.RETRIEVE

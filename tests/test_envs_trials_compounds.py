@@ -72,11 +72,6 @@ def test_true_shapes_are_bodies_of_the_parts(scene):
     np.testing.assert_allclose(scene.position[2], BOX.position, atol=1e-6)
 
 
-def test_a_scene_without_compounds_has_no_parts():
-    assert scenarios.superquadrics((BOX,)).parts is None
-    assert world.true_superquadrics(from_scenario(Scenario("plain", (BOX,), TARGET_BODY))).parts is None
-
-
 def test_parts_become_a_compound_of_their_volume():
     body = SCENE.objects[0]
     scene = jax.device_get(scenarios.superquadrics(SCENE.objects))

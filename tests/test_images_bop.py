@@ -2,7 +2,6 @@
 
 import json
 import types
-import warnings
 
 import numpy as np
 import pytest
@@ -79,17 +78,6 @@ def test_of_too_many_objects_the_largest_and_the_target_stay(tmp_path):
         assert bop_image(folder, target=40).target_id == -1
 
 
-def test_a_target_that_is_said_not_to_show_needs_no_note(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert bop_image(scene(tmp_path, {"0": {"cam_K": K, **POSE}}), target=-1).target_id == -1
-
-
-def test_without_colours_or_masks_there_are_none(tmp_path):
-    images = bop_image(scene(tmp_path, {"0": {"cam_K": K, **POSE}}, masks=0, colour="gray"))
-    assert images.colour is images.mask is images.target_id is None
-
-
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
@@ -106,17 +94,6 @@ def test_a_scene_that_cannot_be_used_is_refused_in_one_line(tmp_path, entry, wor
     with pytest.raises(InputError, match=rf"scene_camera\.json.*{words}") as refused:
         bop_image(scene(tmp_path, {"5": entry}), 5)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_the_number_of_an_image_has_to_be_there(tmp_path):
-    folder = scene(tmp_path, {str(i): {"cam_K": K, **POSE} for i in (4, 9)})
-    with pytest.raises(InputError, match=r"has several images; say which \(it has 2, 4 to 9\)"):
-        bop_image(folder)
-    with pytest.raises(InputError, match="has no image 5"):
-        bop_image(folder, 5)
-    (folder / "depth" / "000004.png").unlink()
-    with pytest.raises(InputError, match=r"depth/000004\.png: cannot be read"):
-        bop_image(folder, 4)
 
 
 def test_plan_takes_a_scene_and_the_configuration_says_where_the_base_is(tmp_path, monkeypatch):

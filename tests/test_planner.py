@@ -571,19 +571,6 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
-        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
-        ({"crowding_weight": float("nan")}, "crowding_weight nan"),
-    ],
-)
-def test_what_is_no_option_is_checked_too(changes, message):
-    with pytest.raises(InputError, match=message):
-        PlannerConfig(**changes)
-
-
-@pytest.mark.parametrize(
     ("name", "message"),
     [
         (
@@ -634,15 +621,6 @@ def test_a_random_policy_is_indifferent_and_its_actions_are_possible(decision, p
     assert len({(int(one.action.kind), int(one.action.object)) for one in chosen}) > 3
 
 
-def test_a_greedy_policy_looks_one_action_ahead_and_minds_nothing_but_the_area():
-    policy = planner.greedy(planner.standard(horizon=3, sequences=40).planner)
-    assert isinstance(policy.objective, type(planner.search_and_grasp().objective))
-    config = policy.config
-    assert (config.horizon, config.sequences, config.guided_fraction) == (1, 40, 0.0)
-    assert (config.crowding_weight, config.unseen_contact_penalty) == (0.0, 0.0)
-    assert planner.policy_factory("greedy") is planner.greedy
-
-
 @pytest.mark.slow
 def test_a_greedy_policy_leaves_the_least_of_f(decision, problem):
     objects, belief, _ = decision
@@ -667,16 +645,6 @@ def test_the_papers_preset_draws_until_an_action_is_possible_and_moves_objects_a
     moved = np.asarray(decided.sequences.actions.object)
     assert any(len(set(o[:n])) < n for o, n in zip(moved, lengths, strict=True))
     assert float(decided.value) < 0
-
-
-@pytest.mark.slow
-def test_a_decision_with_pushes_predicted_by_geometry_is_one_too(decision, problem):
-    objects, belief, learned = decision
-    geometric = planner.search_for_grasp(push_model=QuasiStatic())
-    plan = geometric(jax.random.key(0), problem, belief, seen(objects))
-    assert float(plan.value) < 0
-    assert float(plan.predicted_cost) < float(plan.cost) == float(learned.cost)
-    assert not np.array_equal(np.asarray(plan.sequences.cost), np.asarray(learned.sequences.cost))
 
 
 @pytest.mark.slow

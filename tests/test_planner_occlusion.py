@@ -1,9 +1,5 @@
 """The baseline that moves the object that occludes most: which object that is, and which is next if it cannot move."""
 
-import dataclasses
-import functools
-import pickle
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,18 +9,11 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.policies.occlusion import (
     EACH,
-    NEXT,
-    draw_by_occlusion,
     most_occluding,
     most_occluding_first,
-    occlusion_weights,
-    weights_in_order,
 )
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.prediction import PredictByKind
-from mechsearch_jax.planner.proposal import WeightedDraw, guided_draw
-from mechsearch_jax.runtime.identity import identity
 from mechsearch_jax.workspace import scenario
 
 # Far from each other: one that hides much, one that hides less, one that hides little.
@@ -56,32 +45,6 @@ def decided(problem, names, seed=0, policy=POLICY, pose=None):
 def object_of(decision, names):
     assert int(decision.action.kind) in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
     return names[int(decision.action.object)]
-
-
-def test_draws_by_other_weights_are_other_programs():
-    """Also on disk, where executables are kept; and equal ones in other processes are the same."""
-    draws = pickle.loads(pickle.dumps((guided_draw, draw_by_occlusion)))
-    assert draws == (guided_draw, draw_by_occlusion) == (guided_draw, WeightedDraw(occlusion_weights))
-    assert len({identity(draw) for draw in (guided_draw, draw_by_occlusion)}) == len(set(draws)) == 2
-
-
-@dataclasses.dataclass(frozen=True)
-class Stuck:
-    """A model in which the object at an index cannot be moved."""
-
-    index: int
-
-    def __call__(self, problem, state, sample, first):
-        prediction = PredictByKind(QuasiStatic(), QuasiStatic())(problem, state, sample, first)
-        return prediction.replace(possible=prediction.possible & (sample.action.object != self.index))
-
-
-def test_weights_fall_from_each_object_to_the_next_and_ties_have_the_same():
-    occluded = jnp.float32([3.0, 40.0, 0.0, 3.0, 12.0])
-    expected = np.float32([NEXT**2, 1.0, NEXT**4, NEXT**2, NEXT])
-    np.testing.assert_allclose(weights_in_order(occluded), expected)
-    order = np.array([4, 2, 0, 1, 3])
-    np.testing.assert_allclose(weights_in_order(occluded[order]), expected[order])
 
 
 def test_actions_come_by_their_objects_and_few_of_each():
@@ -118,13 +81,6 @@ def first_values(decision):
 
 
 @pytest.mark.slow
-def test_where_it_cannot_be_moved_the_next_one_is(problem):
-    names = ORDERS[1]
-    stuck = POLICY.replace(predict=Stuck(names.index("wide")))
-    assert {object_of(decided(problem, names, seed, stuck), names) for seed in range(3)} == {"narrow"}
-
-
-@pytest.mark.slow
 def test_once_the_target_is_found_the_object_that_blocks_most_of_its_grasps_is_moved(problem):
     for names in ORDERS[:2]:
         for behind in ("narrow", "wide"):
@@ -134,20 +90,3 @@ def test_once_the_target_is_found_the_object_that_blocks_most_of_its_grasps_is_m
             assert float(decision.value) < 0.0
         # The target itself is never moved.
         assert not (decision.sequences.actions.object == len(decision.predicted.valid)).any()
-
-
-@pytest.mark.slow
-def test_in_a_batch_it_decides_as_alone(problem):
-    rows = [seen(ORDERS[0]), seen(ORDERS[1], (0.62, 0.3, 0.0)), seen(ORDERS[2])]
-    beliefs, observations = (
-        jax.tree.map(lambda *a: jnp.stack(a), *trees) for trees in ([look(problem, row) for row in rows], rows)
-    )
-    keys = jax.random.split(jax.random.key(0), len(rows))
-    together = jax.jit(jax.vmap(functools.partial(POLICY.planned, problem=problem)))(
-        keys, belief=beliefs, observation=observations
-    )
-    for i, row in enumerate(rows):
-        alone = POLICY.planned(keys[i], problem, look(problem, row), row)
-        assert int(together.action.kind[i]) == int(alone.action.kind)
-        assert int(together.action.object[i]) == int(alone.action.object)
-        np.testing.assert_allclose(together.action.T_world_gripper[i], alone.action.T_world_gripper, atol=1e-5)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +11,9 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.actions.types import Prediction, Sample
-from mechsearch_jax.benchmarks.policies.tree_search import mctx, tree_plan, width
+from mechsearch_jax.benchmarks.policies.tree_search import mctx, tree_plan
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 
 CONFIG = planner.PlannerConfig(horizon=2, sequences=64)
@@ -103,12 +101,6 @@ def test_it_looks_ahead_as_far_as_the_horizon(decide):
         assert (float(near.predicted_cost), float(near.value)) == (9.0, -1.0)
 
 
-def test_a_later_gain_is_discounted(decide):
-    """Two steps to the right gain gamma * 6.5 - 0.5, one to the left gains 1."""
-    assert decide(gamma=0.9).action.displacement[1] > 0
-    assert decide(gamma=0.05).action.displacement[1] < 0
-
-
 def test_what_is_impossible_is_never_chosen(decide):
     decision = decide(only_left)
     assert decision.action.displacement[1] < 0
@@ -134,25 +126,6 @@ def test_a_decision_has_the_form_of_any_other(decide, objects):
     assert np.isnan(cost[:, 1:]).all()
     again = decide()
     jax.tree.map(np.testing.assert_array_equal, decision, again)
-
-
-@pytest.mark.parametrize(
-    ("sequences", "horizon", "expected"), [(30, 3, 9), (64, 2, 11), (1, 3, 1), (2, 1, 2), (4, 9, 4)]
-)
-def test_a_node_has_fewer_actions_than_are_predicted(sequences, horizon, expected):
-    assert width(planner.PlannerConfig(sequences=sequences, horizon=horizon)) == expected
-
-
-def test_the_policy_is_known_by_its_name_and_keeps_the_slots():
-    policy = planner.policy_factory("mechsearch_jax.benchmarks.policies.tree_search:mctx")(CONFIG)
-    assert policy.plan is tree_plan
-    assert policy.objective == planner.search_for_grasp().objective
-
-
-def test_without_the_library_it_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mctx", None)
-    with pytest.raises(InputError, match=r"policy mctx needs .*pip install 'mechsearch-jax\[mctx\]'"):
-        mctx(CONFIG)
 
 
 @pytest.mark.slow

@@ -193,13 +193,6 @@ def test_a_right_segmentation_costs_nothing():
     assert np.allclose(overlap[present], 1.0)
 
 
-def test_overlap_of_instances_counts_points():
-    labels = jnp.asarray(np.repeat([0, 1], [60, 40]), jnp.int8)
-    segments = jnp.asarray(np.repeat([3, 5, OTHER], [70, 20, 10]), jnp.int8)
-    overlap, present = segmentation.instance_overlaps(segments, labels)
-    assert np.allclose(overlap[present], [60 / 70, 20 / 40])
-
-
 @pytest.mark.slow
 def test_held_out_scores_tell_apart_what_shows_enough():
     task = segmentation.SegmentationTask(network=SEGMENTATION, points=256, precision=jnp.float32)
@@ -342,13 +335,6 @@ def test_rotation_vectors_are_scipys():
     assert slope[2, 1, 0] == pytest.approx(1.0)
 
 
-def test_there_are_24_symmetries_of_a_box():
-    assert len(recognition.SYMMETRIES) == 24
-    for a, b in itertools.combinations(recognition.SYMMETRIES, 2):
-        assert np.abs(a - b).max() > 0.5
-    assert np.allclose(np.linalg.det(recognition.SYMMETRIES), 1.0)
-
-
 def same_body(kind, half, rotation, other_half, other_rotation):
     """Whether two descriptions at the same place are of the same body, by its corners or its axis, in float64."""
     if kind == CYLINDER:
@@ -435,19 +421,6 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(slope))
 
 
-def test_height_is_relative_to_a_body_at_rest():
-    zero = jnp.zeros((1, HYPOTHESES, model.OUTPUTS + model.UNCERTAIN))
-    decoded = jax.jit(model.decode)(zero, zero[..., 0])
-    down = np.abs(np.asarray(decoded.rotation[0])[:, 2])
-    size = np.asarray(decoded.size[0])
-    for k in range(HYPOTHESES):
-        box = down[k] @ size[k]
-        round_one = down[k, 2] * size[k, 2] + np.sqrt(1 - min(down[k, 2], 1.0) ** 2) * size[k, 0]
-        assert decoded.position[0, k, 2] == pytest.approx(round_one if IS_ROUND[k] else box, abs=1e-6)
-    slope = jax.jit(jax.grad(lambda o: jnp.sum(model.decode(o, zero[..., 0]).position)))(zero)
-    assert np.isfinite(slope).all()
-
-
 # --- weights ---------------------------------------------------------------------------------------------------------
 
 
@@ -517,12 +490,6 @@ def test_damaged_weights_are_refused_in_one_line(tmp_path, name, reason):
         load_weights(path, "recognition")
     assert "\n" not in str(refused.value)
     assert str(tmp_path) in str(refused.value)
-
-
-def test_weights_of_the_other_network_are_refused(tmp_path):
-    save_weights(tmp_path / "w.npz", "recognition", RECOGNITION, parameters("recognition"), {})
-    with pytest.raises(InputError, match="segmentation"):
-        load_weights(tmp_path / "w.npz", "segmentation")
 
 
 # --- training --------------------------------------------------------------------------------------------------------

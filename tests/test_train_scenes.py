@@ -11,10 +11,9 @@ import pytest
 from mechsearch_jax.envs.camera.sensors import SENSORS
 from mechsearch_jax.envs.scenes.generator import outline, separation
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.images.cloud import above_board, cloud_of, draw, resample, shelf_view, view
+from mechsearch_jax.images.cloud import above_board, cloud_of, draw, resample, shelf_view
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import RandomDirection, TimeOfFlight, no_noise
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import CYLINDER
 from mechsearch_jax.train import scenes
 from mechsearch_jax.workspace.camera import Camera, back_project, rays
@@ -127,30 +126,6 @@ def test_scenes_are_as_configured():
     assert jax.vmap(scenes.in_catalogue)(worlds)[:, :3].all()
     assert not jax.vmap(scenes.in_catalogue)(jax.tree.map(lambda a: a * 1.01, worlds))[:, :3].any()
     assert np.allclose(worlds.rotation[..., 2, 2], 1.0)
-
-
-def test_visible_share_counts_what_others_hide():
-    world, seen = clean()
-    share = np.asarray(jax.vmap(scenes.visible_share)(seen))
-    assert ((share >= 0) & (share <= 1)).all()
-    assert (share[world.valid[:, :TARGET] & (seen.pixels == seen.alone) & (seen.alone > 0)] == 1).all()
-    assert (share < 0.9).any()
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"objects": (0, 3)}, {"objects": (5, 17)}, {"known": 1.5}, {"sides": (0.0, 0.1)}, {"noises": ()}]
-)
-def test_impossible_scenes_are_refused(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        scenes.SceneConfig(**wrong)
-
-
-def test_a_view_is_every_so_many_rays_of_the_camera():
-    camera = Camera()
-    for seen in (VIEW, view(camera, (100, 231), (40, 171), 3)):
-        assert np.allclose(seen.of(rays(camera)), rays(seen.camera), atol=1e-6)
-    with pytest.raises(InputError, match="rows"):
-        view(camera, (700, 800), (0, 10))
 
 
 @pytest.mark.slow
@@ -275,9 +250,3 @@ def test_surface_points_are_spread_by_area():
     assert np.allclose(radius[~lid], 0.03, atol=1e-6)
     assert lid.mean() == pytest.approx(0.03 / (0.03 + 2 * 0.05), abs=0.02)
     assert (radius[lid] < 0.0212).mean() == pytest.approx(0.5, abs=0.03)
-
-
-def test_above_board_is_the_free_space_of_the_shelf():
-    inside = jnp.array([[0.6, 0.1, 0.42], [0.6, 0.1, 0.4065], [0.787, 0.1, 0.5], [0.6, 0.482, 0.5], [0.2, 0.1, 0.5]])
-    assert above_board(SHELF, inside).tolist() == [True, False, False, False, False]
-    assert not above_board(SHELF, jnp.full((1, 3), jnp.nan))[0]
