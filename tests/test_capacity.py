@@ -14,7 +14,7 @@ from mechsearch_jax.images.checks import Look
 from mechsearch_jax.images.image_files import load_mask
 from mechsearch_jax.images.labels import FREE, OTHER
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.recogniser import Recogniser, labelled, view_images
+from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.segmentation import leave_out_smallest
 from mechsearch_jax.planner.trials import TrialResult, scenes_of
 from mechsearch_jax.problem.settings import load_settings
@@ -87,28 +87,6 @@ def test_twelve_instances_of_a_mask_are_twelve_objects_in_its_order(look):
     np.testing.assert_array_equal(found(seen.objects), expected)
     with pytest.raises(InputError, match="objects are 0 to 8, all else -1, -2 or -3; for more things, set capacity"):
         recogniser(8)(KEY, depth, mask=mask, target_id=-1)
-
-
-@pytest.mark.slow
-def test_with_more_slots_more_of_twelve_boxes_have_a_segment(look):
-    depth, mask = look
-
-    def matched(capacity):
-        see = recogniser(capacity)
-        images = view_images(see.view, depth, None, None, None)
-        labels = np.asarray(labelled(see.core, KEY, KINECT, see.view, TABLE, images)[0].labels)
-        true = np.asarray(see.view.of(jnp.asarray(mask)))
-        numbers = np.unique(labels[labels >= 0])
-        assert set(numbers.tolist()) <= set(range(capacity))
-        either = [[((true == i) | (labels == n)).sum() for n in numbers] for i in range(12)]
-        both = [[((true == i) & (labels == n)).sum() for n in numbers] for i in range(12)]
-        return (np.array(both) > 0.5 * np.array(either)).any(axis=1).sum(), len(numbers)
-
-    few, _ = matched(8)
-    many, segments = matched(16)
-    assert few <= 8
-    assert many >= 11
-    assert segments <= 14
 
 
 @pytest.mark.parametrize(("count", "capacity"), [(9, 8), (18, 16), (18, 12), (9, 3), (9, 9)])

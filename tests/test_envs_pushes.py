@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 import json
 
 import jax
@@ -147,31 +146,6 @@ def test_objects_are_displaced_along_the_push(pushes):
     assert (along[upright] < length[upright] + 0.03).all()
     assert (along[upright] > -0.005).all()
     assert np.median((along / np.maximum(length - 0.01, 0.01))[upright]) == pytest.approx(1.0, abs=0.35)
-
-
-@pytest.mark.slow
-def test_objects_that_are_far_from_the_push_stay(pushes):
-    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
-    assert 0.1 < truth.moved[truth.valid].mean() < 0.9
-    middle = pushes.T_world_gripper[:, :3, 3] + 0.5 * pushes.displacement
-    away = np.linalg.norm(pushes.before.position[..., :2] - middle[:, None, :2], axis=-1)
-    # Links of the arm may still strike what is 0.35 m away.
-    far = truth.valid & (away > 0.4)
-    assert far.sum() > 3
-    assert not truth.moved[far].any()
-
-
-@pytest.mark.slow
-def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
-    followed = 0
-    for lane in np.unique(pushes.lane):
-        rows = np.flatnonzero(pushes.lane == lane)
-        for a, b in itertools.pairwise(rows):
-            if np.array_equal(pushes.after.half_size[a], pushes.before.half_size[b]):
-                followed += 1
-                valid = pushes.before.valid[b]
-                np.testing.assert_array_equal(pushes.after.position[a][valid], pushes.before.position[b][valid])
-    assert followed >= 3
 
 
 def upright_world(kind, rotation):

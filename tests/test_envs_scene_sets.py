@@ -10,13 +10,12 @@ from stage import stays_put
 
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.scenes import scene_sets
-from mechsearch_jax.envs.scenes.generator import GeneratorConfig, outline, separation
-from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
-from mechsearch_jax.envs.scenes.three_objects import LineConfig, LineGenerator
+from mechsearch_jax.envs.scenes.generator import outline, separation
+from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, make_scene, recorded, scene_files
+from mechsearch_jax.envs.scenes.three_objects import LineConfig
 from mechsearch_jax.envs.world import world
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime import kept_arrays
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 
@@ -140,28 +139,6 @@ def test_two_cylinders_in_line_hide_the_target_each_by_itself():
         stays_put(scene)
         sizes += [(body.half_size[0], body.half_size[2]) for body in scene.objects]
     assert np.ptp(sizes, axis=0) == pytest.approx([0.01, 0.045], rel=0.4)
-
-
-def test_what_cannot_be_in_line_is_one_line():
-    with pytest.raises(InputError, match="seed: -1 is negative"):
-        LineGenerator().generate(-1)
-    thin = LineGenerator(LineConfig(radius=(0.005, 0.006), attempts=5), GeneratorConfig(visible=100))
-    with pytest.raises(InputError, match="mine: no scene fits in 5 attempts"):
-        thin.generate(0, "mine")
-
-
-def test_names_of_scenes():
-    block, index = find_scene("c2-4-017")
-    assert (block.name, index, block.scene_name(index)) == ("c2-4", 17, "c2-4-017")
-    assert find_scene("d1-199") == (SETS["d1"].blocks[0], 199)
-    for none in ("d1-200", "c2-017", "c2-4-17", "c2-4", "c2-5-000", "first-light", ""):
-        assert find_scene(none) is None, none
-    assert find_set("d3-4").blocks == (SETS["d3"].blocks[0],)
-    with pytest.raises(InputError, match="c9: there is no such scene set; there are c2, c2-2, "):
-        find_set("c9")
-    for index in (-1, 180):
-        with pytest.raises(InputError, match=f"c2-4: there is no scene {index}; there are 180"):
-            make_scene(block, index)
 
 
 @pytest.fixture

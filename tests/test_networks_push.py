@@ -278,26 +278,6 @@ def test_the_distance_between_objects_is_that_of_small_steps():
     assert count >= 2
 
 
-def test_how_objects_meet_is_known_where_it_is_plain():
-    # The second is 2 cm to the left of straight ahead, the third askew, with a corner ahead; the fourth is passed by.
-    scene = standing(
-        ((0.02, 0.03, 0.05), BOX, 0.6, 0.0, 0.0),
-        ((0.02, 0.02, 0.05), BOX, 0.7, 0.02, np.pi / 2),
-        ((0.02, 0.02, 0.05), BOX, 0.7, -0.05, np.radians(30)),
-        ((0.02, 0.02, 0.05), ROUND, 0.7, 0.2, 0.0),
-    )
-    met = jax.jit(contacts.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
-    assert float(met.distance[0, 1]) == pytest.approx(0.06, abs=1e-6)
-    np.testing.assert_allclose(met.normal[0, 1], [1.0, 0.0], atol=1e-5)
-    # From 0 to 3 cm to the left of the first's centre, and from 2 cm to the right to 1 cm to the left of the second's.
-    np.testing.assert_allclose([met.middle[0, 1], met.breadth[0, 1]], [0.015, 0.03], atol=1e-6)
-    np.testing.assert_allclose([met.middle[1, 0], met.breadth[1, 0]], [-0.005, 0.03], atol=1e-6)
-    # The right front corner of the first meets the left one of the third's near sides.
-    np.testing.assert_allclose(met.normal[0, 2], [np.sin(np.radians(30)), -np.cos(np.radians(30))], atol=1e-4)
-    assert float(met.breadth[0, 3]) == pytest.approx(0.2 - 0.02 - 0.03 - 2 * 0.15, abs=1e-6)
-    assert float(met.distance[0, 3]) == pytest.approx(REACH)
-
-
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
 def test_at_cylinders_objects_meet_along_the_line_to_their_axis(yaw):
     # Two cylinders, 2.4 cm askew; a box, whose right front corner the first meets, and one whose face it meets.

@@ -80,24 +80,6 @@ def test_a_tower_is_one_body_whatever_its_order():
         assert np.sum(np.asarray(after.valid)) == 3
 
 
-def test_the_largest_parts_are_kept_where_there_is_no_room():
-    pieces, evidence = cubes((0.0, 0.0), (0.0, 2 * SIDE + 0.5 * TOUCHES), parts=3)
-    small = np.asarray(pieces.size).copy()
-    small[1, :2] *= 0.5
-    after, owner = join_floating(pieces.replace(size=jnp.asarray(small)), evidence, BOARD)
-    assert np.asarray(owner).tolist() == [0, 0]
-    assert np.sum(np.asarray(after.valid), axis=1).tolist() == [PARTS, 0]
-    np.testing.assert_allclose(np.asarray(after.size)[0], SIDE)
-
-
-def test_an_absent_body_is_joined_to_nothing_and_nothing_to_it():
-    pieces, evidence = cubes((0.0, 0.0), (0.0, 2 * SIDE + 0.5 * TOUCHES))
-    for gone in (0, 1):
-        valid = np.asarray(pieces.valid).copy()
-        valid[gone] = False
-        assert np.asarray(join_floating(pieces.replace(valid=valid), evidence, BOARD)[1]).tolist() == [0, 1]
-
-
 @settings(deadline=None, max_examples=10)
 @given(st.lists(st.tuples(st.floats(0.0, 0.3), st.floats(0.0, 0.2)), min_size=3, max_size=3))
 @pytest.mark.slow

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions.candidates import BLOCK, _gumbel
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.geometry.superquadric import empty, pad
 from mechsearch_jax.grasping.graspability import INFEASIBLE, graspability, pairs
-from mechsearch_jax.grasping.retrieval import best_grasp
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import present_state
 from mechsearch_jax.workspace import scenario
@@ -55,31 +53,6 @@ def test_g_and_j_are_the_same(problem):
             state = state.replace(exists=exists | somewhere, target_at=at)
             costs = [float(objective.cost(problem, known, state.replace(hits=h), Weights())) for h in (hits, wider)]
             assert costs[0] == costs[1]
-
-
-def test_an_object_draws_the_same_numbers():
-    key = jax.random.key(3)
-    few, usual, many = (np.asarray(_gumbel(key, 2, n, 7)) for n in (5, BLOCK, 20))
-    np.testing.assert_array_equal(usual.reshape(-1), jax.random.gumbel(key, (2 * BLOCK * 7,)))
-    np.testing.assert_array_equal(few[:, :4], usual[:, :4])
-    np.testing.assert_array_equal(many[:, :8], usual[:, :8])
-    for other in (few, many):
-        np.testing.assert_array_equal(other[:, -1], usual[:, -1])
-    assert len(np.unique(many)) == many.size
-
-
-@pytest.mark.slow
-def test_the_target_is_taken_out_the_same_way(problem, objects):
-    scenes = [pad(objects, capacity) for capacity in CAPACITIES]
-    pose = jnp.float32([0.6, 0.1, 0.0])
-    one, other = (best_grasp(problem.target_grasps, scene, pose) for scene in scenes)
-    same(one, other)
-    assert one.feasible
-    assert 0 < one.hits < INFEASIBLE
-    # Nothing is feasible where there is nothing to be grasped.
-    for scene in scenes:
-        none = best_grasp(problem.target_grasps, scene, pose, jnp.array(False))
-        assert (bool(none.success), bool(none.feasible), int(none.hits)) == (False, False, INFEASIBLE)
 
 
 @pytest.mark.slow

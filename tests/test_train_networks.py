@@ -20,7 +20,6 @@ from mechsearch_jax.networks import segmentation as layers
 from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
 from mechsearch_jax.networks.segmentation import (
     SegmentationConfig,
-    SegmentationNetwork,
     nearest_neighbours,
     strongest_neighbour,
 )
@@ -28,7 +27,7 @@ from mechsearch_jax.networks.weights import load_weights, save_weights
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
-from mechsearch_jax.train import loop, recognition, scenes, segmentation
+from mechsearch_jax.train import recognition, scenes, segmentation
 from mechsearch_jax.train.loop import CHECKPOINT, SCALARS, TrainConfig, initial_state, learning_rate, train
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -56,19 +55,6 @@ def one_program(monkeypatch):
 
 
 # --- segmentation ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_segmentation_follows_the_order_of_the_points():
-    points = jax.random.uniform(jax.random.key(0), (2, 96, 3)) * 0.2 + jnp.array([[[0.5, 0.0, 0.42]]])
-    order = jax.random.permutation(jax.random.key(1), 96)
-    network = jax.jit(SegmentationNetwork(SEGMENTATION).apply)
-    output = network({"params": parameters("segmentation")}, points)
-    turned = network({"params": parameters("segmentation")}, points[:, order])
-    assert output.logits.shape == (2, 2, 96, 10)
-    assert np.allclose(output.logits[:, :, order], turned.logits, atol=1e-3)
-    assert np.allclose(output.centres[:, order], turned.centres, atol=1e-4)
-    assert np.std(output.logits[-1]) > 1e-2
 
 
 # The CPU takes the one, a GPU the other.
@@ -119,24 +105,6 @@ def test_the_strongest_neighbour_and_its_gradient_are_those_of_plain_differentia
     for a, b in zip(ours_slopes, slopes, strict=True):
         assert np.allclose(a, b, atol=1e-5)
         assert np.abs(b).max() > 0.1
-
-
-def test_the_strongest_neighbour_takes_features_of_16_bits():
-    keys = jax.random.split(jax.random.key(4), 3)
-    features = jax.random.normal(keys[0], (40, 8), jnp.bfloat16)
-    offsets, place = jax.random.normal(keys[1], (40, 300, 3)), jnp.ones((3, 8), jnp.bfloat16)
-    neighbours = jax.random.randint(keys[2], (40, 300), 0, 40)
-    strongest = jax.jit(strongest_neighbour)(features, offsets, place, neighbours)
-    exact = np.asarray(features, float)[neighbours] + np.asarray(offsets, float).sum(axis=-1, keepdims=True)
-    assert strongest.dtype == jnp.float32
-    assert np.allclose(strongest, exact.max(axis=1), atol=1e-5)
-    slopes = jax.jit(jax.grad(lambda *a: jnp.sum(strongest_neighbour(*a, neighbours)), argnums=(0, 1, 2)))(
-        features, offsets, place
-    )
-    assert [a.dtype for a in slopes] == [jnp.bfloat16, jnp.float32, jnp.bfloat16]
-    counts = np.zeros((40, 8))
-    np.add.at(counts, (np.take_along_axis(np.asarray(neighbours), exact.argmax(axis=1), axis=1), np.arange(8)), 1)
-    assert np.allclose(np.asarray(slopes[0], float), counts)
 
 
 def numpy_segmentation_loss(logits, labels):
@@ -191,24 +159,6 @@ def test_a_right_segmentation_costs_nothing():
     overlap, present = segmentation.instance_overlaps(segments, labels)
     assert np.array_equal(present, np.isin(np.arange(9), [0, 1, 4]))
     assert np.allclose(overlap[present], 1.0)
-
-
-@pytest.mark.slow
-def test_held_out_scores_tell_apart_what_shows_enough():
-    task = segmentation.SegmentationTask(network=SEGMENTATION, points=256, precision=jnp.float32)
-    scored = segmentation.held_out_scores(task, parameters("segmentation"), 8, batch=8)
-    # The same computation as within, so that it is compiled once.
-    key = jax.random.fold_in(jax.random.key(loop.HELD_OUT_SEED), 0)
-    *_, present, worth, objects, _ = jax.device_get(segmentation._score_batch(task, parameters("segmentation"), key, 8))
-    assert (present.sum(axis=1) <= objects).all()
-    assert (worth <= present).all()
-    assert worth.any(axis=1).all()
-    assert sum(group["scenes"] for group in scored.values()) == 8
-    assert sum(group["all"]["objects"] for group in scored.values()) == present.sum()
-    assert sum(group["100 pixels and more"]["objects"] for group in scored.values()) == worth.sum()
-    for group in scored.values():
-        for part in ("all", "100 pixels and more"):
-            assert 0.0 < group[part]["iou_raw"] < 0.9
 
 
 def test_clean_up_removes_specks_and_dissolves_small_segments():
