@@ -1,5 +1,6 @@
-"""Reports: the numbers are those of the rows, in every file, and no two configurations share a line."""
+"""Reports: the numbers are those of the rows, in every file, by variant and by scene."""
 
+import collections
 import csv
 import dataclasses
 import io
@@ -9,15 +10,23 @@ import re
 import pytest
 from matplotlib import image
 from rich.console import Console
+from stored_rows import USUAL, row_of
 
-from mechsearch_jax.benchmarks.report import report
+from mechsearch_jax.benchmarks.report import report, report_bench
 from mechsearch_jax.benchmarks.report.episode_tables import events_summary_table, summary_table
+from mechsearch_jax.benchmarks.report.films import FOLDER
+from mechsearch_jax.benchmarks.report.report import Report, read_tables
 from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
+from mechsearch_jax.benchmarks.report.scene_map import COLOURS, SOMETIMES, WORDS, drawn_files
+from mechsearch_jax.benchmarks.statistics.by_scene import ENDS, by_scene, end_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.preset_names import preset_name
 from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key
-from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, write_rows
+from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, episode_key, identity, write_rows
+from mechsearch_jax.envs.world.mismatch import Mismatch
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
 
 WON = EpisodeRow("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
@@ -151,3 +160,94 @@ def test_scenarios_that_changed_between_rows_are_named(tmp_path):
     many = [dataclasses.replace(row, scenario=f"s{i}") for i in range(7) for row in (same, other)]
     assert report.changed_scenarios_remark(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
     assert report.changed_scenarios_remark([same]) == ""
+
+
+def test_drawn_rows_are_those_of_a_sweep(tmp_path):
+    rows = report_bench.drawn_rows(4 * 96 * 4)
+    key = Key.of(rows)
+    assert len(key.short) == 96
+    assert key.named(report_bench.REPORTS["with paired differences"][1])
+    assert len({identity(row) for row in rows}) == len(rows)
+    assert set(collections.Counter((row.scenario, row.configuration) for row in rows).values()) == {report_bench.SEEDS}
+    write_rows(rows, tmp_path / "rows.parquet")
+    assert read_tables([tmp_path / "rows.parquet"]) == rows
+    assert rows == report_bench.drawn_rows(len(rows), 0) != report_bench.drawn_rows(len(rows), 1)
+
+
+@pytest.mark.slow
+def test_the_command_reports_all_rows():
+    begun = []
+    value = json.loads(json.dumps(report_bench.bench_report(800, begun.append)))
+    assert (value["rows"], value["variants"]) == (800, 96)
+    assert [run["what"] for run in value["runs"]] == list(report_bench.REPORTS) == begun[1:]
+    assert all(run["seconds"] > 0.5 and run["memory"] > 50 and run["bytes"] > 10_000 for run in value["runs"])
+    assert report_bench.timings_table(value).row_count == 2
+
+
+QUIET = {"truth_lost": 0, "restarts": 0, "held_up": 0, "unsettled": 0}
+NEVER = {"found_step": None, "graspable_step": None, "retrieved": False, "steps": 10, "failure": "not found"}
+BLOCKED = {**NEVER, "found_step": 3, "failure": "found, but not graspable"}
+MASKS = dataclasses.replace(USUAL, recognition="masks")
+PAPER = dataclasses.replace(USUAL, config=PRESETS["paper"]())
+METHODS = (USUAL, MASKS, PAPER)
+
+
+def rows_of():
+    """Three variants: the first scene is hard for two of them, the second easy, the third hard for all."""
+    rows = []
+    for method in METHODS:
+        rows.append(row_of("set-4-000", method, **QUIET, **({} if method is USUAL else NEVER)))
+        rows.append(row_of("set-4-001", method, **QUIET))
+        rows.append(row_of("set-8-000", method, **QUIET, **(BLOCKED if method is PAPER else NEVER)))
+    return rows
+
+
+def test_variants_are_called_by_their_presets_and_what_deviates():
+    key = Key.of(rows_of())
+    assert sorted(key.short.values()) == ["paper", "standard", "standard, masks"]
+    assert key.numbered
+    assert [key.short[key.named(text)] for text in ("paper", "standard", "standard, masks", "masks")] == [
+        *("paper", "standard"), *["standard, masks"] * 2,
+    ]  # fmt: skip
+    changed = dataclasses.replace(
+        USUAL,
+        name="random",
+        config=PRESETS["paper"](gamma=0.5),
+        mismatch=Mismatch(friction=0.5),
+    )
+    name = preset_name(changed.options(), str)
+    assert name.preset == "paper"
+    assert set(name.deviations.split(", ")) == {"gamma 0.5", "random", "friction 0.5"}
+
+
+def test_scenes_are_ranked_by_how_hard_they_are_and_seeds_are_averaged_first():
+    again = row_of("set-4-000", MASKS, seed=1)
+    scenes = by_scene([*rows_of(), again])
+    assert [(scene.scenario, round(scene.retrieved, 3)) for scene in scenes] == [
+        *(("set-4-000", 0.5), ("set-4-001", 1.0), ("set-8-000", 0.0)),
+    ]  # fmt: skip
+    assert len(scenes[0].every) == 4
+    assert {end_of(row) for row in rows_of()} == {"retrieved", "found", "hidden"}
+    assert end_of(row_of("set-4-000", **{**NEVER, "failure": "error: out of memory"})) == "error"
+    assert end_of(row_of("set-4-000", retrieved=False, failure="retrieval: missed")) == "graspable"
+    assert set(ENDS) | {SOMETIMES} == set(COLOURS) == set(WORDS)
+
+
+def test_a_report_holds_the_map_and_failures_by_variant(tmp_path):
+    rows = rows_of()
+    (tmp_path / FOLDER).mkdir()
+    drawn = f"{episode_key(rows[0])}.html"
+    (tmp_path / FOLDER / drawn).write_text("a page")
+    report = dataclasses.replace(Report.of(rows), drawn=drawn_files(tmp_path))
+    write_report(report, tmp_path)
+    text, page = ((tmp_path / name).read_text(encoding="utf-8") for name in ("report.md", "report.html"))
+    assert f'<td class=retrieved><a href="{FOLDER}/{drawn}">3</a></td>' in page
+    assert "Scenes by difficulty: see scenes.csv." in text
+    assert re.search(r"\| variant +\| +lost \| +not found \| +found, but not graspable \|", text)
+    assert re.search(r"\| paper +\| +0\.67 \| +0\.33 \| +0\.33 \|", text)
+    assert re.search(r"\| standard, masks +\| standard +\| masks +\|", text)
+    with open(tmp_path / "scenes.csv", newline="") as file:
+        first, *_, last = csv.DictReader(file)
+    assert (first["scenario"], first["standard"], first["paper"]) == ("set-4-000", "1", "0")
+    assert (last["scenario"], float(last["retrieved"])) == ("set-8-000", 0.0)
+    assert "see scenes.csv" in (tmp_path / "report.tex").read_text()
