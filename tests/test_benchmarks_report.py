@@ -103,32 +103,6 @@ def test_a_narrow_screen_drops_no_column(table):
     assert (lines, "…" in text) == ([["2", "1"], ["8", "1"], ["all", "2"]], False)
 
 
-def test_a_report_says_what_happened_on_the_way(tmp_path):
-    """Of three episodes one does not say it; the others had eight looks together."""
-    fell = "an object fell off the board"
-    rows = [
-        dataclasses.replace(WON, seed=1, **KNOWN),
-        dataclasses.replace(
-            LOST, **{**KNOWN, "truth_lost": 3, "objects_fallen": 2, "fallen_step": 4}, failure=f"{fell} at action 4"
-        ),
-        dataclasses.replace(LOST, seed=2, failure=f"{fell} at action 10"),
-    ]
-    write_report(rows, tmp_path)
-    text = page_of(tmp_path)
-    assert "| search-for-grasp | all | 2 | 0.500 | 0.375 | 0.000 | 0.000 | 0.500 | 0.000 | 0.000 |" in text
-    with open(tmp_path / "events.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert [(line["objects"], line["episodes"], line["fallen"]) for line in lines] == [
-        ("2", "2", "0.5"),
-        ("all", "2", "0.5"),
-    ]
-    assert json.loads((tmp_path / "rates.json").read_text())["events"][1]["truth_lost"] == 0.5
-    assert report.failures(rows) == [report.Failures("search-for-grasp", fell, 2, 2 / 3)]
-    assert events_summary_table(summarise_events(rows), Key.of(rows)).row_count == 2
-    unknown = [dataclasses.replace(row, truth_ruled_out=None) for row in rows]
-    assert [events.texts()[2] for events in summarise_events(unknown)] == ["", ""]
-
-
 def test_configurations_do_not_mix():
     rows = [WON, dataclasses.replace(WON, gamma=0.5, retrieved=False, failure="not found")]
     assert [(r.method, r.retrieved) for r in summarise(rows) if r.objects is None] == [

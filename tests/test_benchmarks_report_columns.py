@@ -1,6 +1,5 @@
 """Reports by any columns: labels and their key, paired differences, intervals of steps, pages, and single episodes."""
 
-import csv
 import dataclasses
 import itertools
 import math
@@ -16,14 +15,13 @@ from mechsearch_jax.benchmarks.pages.pages import Heading, Paragraph, Table, as_
 from mechsearch_jax.benchmarks.report import films
 from mechsearch_jax.benchmarks.report.report import Report, ReportOptions
 from mechsearch_jax.benchmarks.report.report_figures import curve_figure
-from mechsearch_jax.benchmarks.report.report_files import write_report
 from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.statistics.paired import paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, episode_key, options_of, write_rows
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, options_of, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -162,25 +160,6 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     assert (by_seed.pairs, by_seed.scenes, by_seed.mean) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
 
 
-def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
-    rows = rows_of(96, lost=lambda variant, episode: episode == variant % 3)
-    write_report(Report.of(rows, ReportOptions(baseline="V01", paired=["scenario"])), tmp_path)
-    text, page = (re.sub(" +", " ", (tmp_path / name).read_text()) for name in ("report.md", "report.html"))
-    assert len(re.findall(r"^\| [a-d] \| .* \| V\d\d \| all \|", text, re.MULTILINE)) == 96
-    assert "see rates.csv" in text
-    assert "| V96 | 1 | a |" not in text
-    # Rates and actions by number of objects.
-    assert page.count("<details>") == 2
-    with open(tmp_path / "key.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert len(lines) == 96
-    assert (lines[0]["label"], lines[0]["gamma"], lines[0]["push_distances"]) == ("V01", "0.5", "0.1 0.2")
-    with open(tmp_path / "rates.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 96 * 3
-    with open(tmp_path / "paired.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 95 * 9
-
-
 def test_a_page_is_written_three_ways():
     long = "x" * 100
     table = Table.of(("x", "n"), [("p|q\n<r>", "0.50"), *[(long, 1)] * 99])
@@ -232,7 +211,7 @@ def test_the_command_reports_what_its_options_name(tmp_path, monkeypatch, capsys
         cli.parse(["report", "table.parquet", "--paired", "scenario"])()
 
 
-def test_episodes_are_chosen_for_what_they_show(tmp_path):
+def test_episodes_are_chosen_for_what_they_show():
     lost = [
         dataclasses.replace(LOST, scenario=f"l{i}", failure=f"{reason} at action {i}")
         for i, reason in enumerate(["dropped", "dropped", "fell", "dropped", "held up"])
@@ -251,40 +230,6 @@ def test_episodes_are_chosen_for_what_they_show(tmp_path):
     assert [row.failure.partition(" at")[0] for row in by_why[films.LOST]] == ["dropped", "fell", "held up"]
     assert by_why[films.SLOWEST][0] is slow
     assert films.chosen([broken]) == []
-
-    drawn = []
-
-    def draw(row, file):
-        drawn.append(row)
-        if row in lost:
-            raise InputError("no such scenario")
-        file.parent.mkdir(exist_ok=True)
-        file.write_bytes((tmp_path / "report" / "rates.png").read_bytes())
-        return ""
-
-    write_report(rows, tmp_path / "report")
-    shown = films.films(rows, tmp_path / "report", draw)
-    assert len(drawn) == len({episode_key(row) for _, row in chosen})
-    assert [film.drawn for film in shown] == [row not in lost for _, row in chosen]
-    write_report(dataclasses.replace(Report.of(rows), films=shown), tmp_path / "report")
-    page = (tmp_path / "report" / "report.html").read_text()
-    # One variant has no picture of all of them.
-    assert page.count("<img") == 1 + sum(film.drawn for film in shown)
-    assert "no picture: no such scenario" in page
-    assert "Every step of" not in page
-    # A page beside the picture is linked.
-    first = next(film for film in shown if film.drawn)
-    (tmp_path / "report" / first.page).write_text("a page")
-    again = films.films(rows, tmp_path / "report")
-    assert [film.has_page for film in again] == [film.page == first.page for film in again]
-    write_report(dataclasses.replace(Report.of(rows), films=again), tmp_path / "report")
-    assert f'<a href="{first.page}">' in (tmp_path / "report" / "report.html").read_text()
-    assert f"]({first.page})" in (tmp_path / "report" / "report.md").read_text()
-    # What is there is not drawn again.
-    count, paged = len(drawn), [film.row for film in again if film.has_page]
-    films.films(rows, tmp_path / "report", draw)
-    without = {episode_key(row) for _, row in chosen} - {episode_key(row) for row in paged}
-    assert {episode_key(row) for row in drawn[count:]} == without
 
 
 def test_a_method_is_what_its_options_say():

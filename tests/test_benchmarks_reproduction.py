@@ -17,7 +17,6 @@ from mechsearch_jax.benchmarks.lab.site.findings import (
 from mechsearch_jax.benchmarks.lab.site.store_run import run_of
 from mechsearch_jax.benchmarks.lab.site.stored_tables import results_of_runs
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, PICK_AND_PLACE, PUSH, TABLES
-from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.runs import write_run
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
@@ -132,27 +131,6 @@ def test_one_kind_of_action_is_compared_with_both():
         assert (one.verdict, one.change.value, one.change.count) == (HOLDS, pytest.approx(value), 80)
     # Pushes: 0.907 and 0.813, 0.92 and 0.773; pick-and-places: 0.76 and 0.627, 0.76 and 0.693.
     assert one.paper == pytest.approx((0.907 + 0.813 + 0.92 + 0.773 - 0.76 - 0.627 - 0.76 - 0.693) / 4)
-
-
-def test_boxes_are_compared_with_other_scenes():
-    def boxes(policy, recognition, actions, objects, number):
-        return 1, 2 if number % 2 else None
-
-    runs = [
-        run_of("boxes", list(rows_of("table5", 40, boxes)), command="reproduce table5"),
-        run_of("cylinders", list(rows_of("table1", 40, lambda *_: (1, 2))), command="reproduce table1"),
-    ]
-    tables = {name: results_of_runs(TABLES[name], runs) for name in ("table1", "table5")}
-    (one,) = verdicts(finding("With 4 objects, boxes"), tables)
-    assert (one.verdict, one.change.value) == (HOLDS, -0.5)
-    # Newcombe's method 10, of 40 scenes a side: the two methods of a scene end alike.
-    low, high = wilson(20, 40)
-    least, _ = wilson(40, 40)
-    assert one.change.interval == pytest.approx(
-        (-0.5 - (0.5 - low), -0.5 + ((high - 0.5) ** 2 + (1 - least) ** 2) ** 0.5), abs=0.01
-    )
-    (other,) = verdicts(finding("With 8 objects, boxes"), tables)
-    assert other.verdict == FAILS
 
 
 def test_the_newest_run_of_a_cell_counts():

@@ -14,9 +14,7 @@ from stage import HIDDEN, OPEN, TWO
 
 from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks.lab.ceiling import solvability
-from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, read_outcomes, summary
-from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
-from mechsearch_jax.benchmarks.store.shards import ShardWriter
+from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, summary
 from mechsearch_jax.envs.episode.records import ActionRecord
 from mechsearch_jax.envs.known_target.judgement import Judgement
 from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node
@@ -24,9 +22,6 @@ from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.workspace.scenario import load_scenario
 
-EPISODE = EpisodeRow(
-    "two", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.5
-)
 PUSH = ActionRecord("push", 0, np.eye(4).tolist(), [0.0, 0.1, 0.0], np.eye(4).tolist(), 0.7, 0.0)
 
 
@@ -44,30 +39,6 @@ def result_of(start, best=None, actions=None):
     begin = Node(world, (), start)
     reached = begin if best is None else Node(world, (PUSH,), best)
     return KnownSearchResult(actions, reached, begin, 3, 70, Counter())
-
-
-def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_path):
-    table = tmp_path / "rows.parquet"
-    hashed = dataclasses.replace(EPISODE, configuration="{}", content_hash=TWO.content_hash, retrieved=False)
-    write_rows([hashed, dataclasses.replace(hashed, scenario="another name", seed=1, retrieved=True)], table)
-    stored = tmp_path / "stored.json"
-    episodes = [{"scenario": "hidden", "retrieved": True}, {"scenario": "two", "retrieved": True}]
-    stored.write_text(json.dumps({"runs": [{"episodes": episodes}]}))
-    listed = tmp_path / "listed.json"
-    columns = ["scenario", "seed", "retrieved", "content_hash"]
-    runs = [{"episodes": [["two", 0, True, "other"], ["hidden", 0, False, HIDDEN.content_hash]]}]
-    listed.write_text(json.dumps({"columns": columns, "runs": runs}))
-
-    assert read_outcomes([table]).of(TWO) == (2, 1)
-    with ShardWriter(tmp_path / "folder" / "inside", "me") as writer:
-        writer.append([hashed])
-    assert read_outcomes([tmp_path / "folder"]).of(TWO) == (1, 0)
-    assert read_outcomes([stored]).of(TWO) == (1, 1)
-    # The scene of that name held something else.
-    assert read_outcomes([listed]).of(TWO) == (0, 0)
-    everything = read_outcomes([table, stored, listed])
-    assert [everything.of(scene) for scene in (TWO, HIDDEN, OPEN)] == [(3, 2), (2, 1), (0, 0)]
-    assert read_outcomes([]).of(TWO) == (0, 0)
 
 
 @pytest.fixture

@@ -194,14 +194,18 @@ def test_what_is_wrong_in_a_file_is_named_with_its_place(folder, jobs_of, text, 
         jobs_of("sweep", "one.json", "--file", "sweep.toml")
 
 
-@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
-def test_every_option_may_be_swept(option):
-    usual = standard().options()[option.name]
-    usual = option.outside(usual)
-    given = ",".join(map(str, usual)) if isinstance(usual, list | tuple) else str(usual)
-    arguments = ("sweep", "first-light", "--out", "out", f"--{option.name.replace('_', '-')}", given, given)
-    points = cli.parse(arguments).keywords["options"].points()
-    assert [point.settings().config for point in points] == [standard()] * 2
+def test_every_option_may_be_swept():
+    once, twice, usual = [], [], standard().options()
+    for option in OPTIONS:
+        value = option.outside(usual[option.name])
+        given = ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        once += [f"--{option.name.replace('_', '-')}", given]
+        twice += [*once[-2:], given]
+    one, several = (
+        cli.parse(["sweep", "first-light", "--out", "out", *more]).keywords["options"] for more in (once, twice)
+    )
+    assert [point.settings().config for point in one.points()] == [standard()]
+    assert {len(getattr(several, option.name)) for option in OPTIONS} == {2}
 
 
 def test_what_a_run_would_take_is_printed_and_nothing_is_run(folder, capsys):

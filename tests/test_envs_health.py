@@ -10,7 +10,6 @@ import pytest
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.health import cell_health as health
 from mechsearch_jax.envs.health.cell_health import State
-from mechsearch_jax.problem import cache
 from mechsearch_jax.problem.problem import NOWHERE
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
@@ -117,23 +116,3 @@ def test_a_check_that_fails_is_reported():
     (needed,) = health.examine("simulator", fails)
     assert (needed.state, needed.says) == (State.BROKEN, "RuntimeError: two lines")
     assert next(iter(health.examine("meshes", fails))).state is State.MISSING
-
-
-@pytest.mark.parametrize(("state", "status"), [(State.MISSING, None), (State.BROKEN, 1)])
-def test_the_status_says_whether_the_main_job_runs(monkeypatch, capsys, state, status):
-    def check():
-        yield health.Finding("weights", state, "gone", "install them")
-
-    monkeypatch.setattr(health, "CHECKS", {"weights": check})
-    monkeypatch.setattr(cache, "is_cached", lambda *args, **parts: True)
-    command = cli.parse(["doctor"])
-    if status:
-        with pytest.raises(SystemExit) as end:
-            command()
-        assert end.value.code == status
-    else:
-        command()
-    printed = capsys.readouterr().out
-    assert "gone" in printed
-    assert "-> install them" in printed
-    assert printed.splitlines()[-1] == ("nothing can be searched here" if status else "searching works here")

@@ -1,31 +1,25 @@
 """Worlds that are not as the planner assumes: what the simulator and the camera make of a `Mismatch`."""
 
 import dataclasses
-import itertools
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from stage import HIDDEN, OPEN, grab
 
 from mechsearch_jax.actions import KINDS, ActionKind
 from mechsearch_jax.envs.camera.recognisers import recogniser
-from mechsearch_jax.envs.camera.sensing import Sensing, resized, sensing_of, true_camera
+from mechsearch_jax.envs.camera.sensing import sensing_of, true_camera
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
-from mechsearch_jax.envs.episode.many_slots import ManySlots, _look
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.episode.slots import OneSlot
 from mechsearch_jax.envs.simulators.native import COARSE_STEP, FINE_STEP, PHYSICS, NativeSimulator, NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, Mismatch
 from mechsearch_jax.envs.world.model import body_geometries
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
-from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.images.noise import no_noise
 from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -174,34 +168,6 @@ def test_objects_are_recognised_as_large_as_their_spread_says_and_stand_where_th
     shares = [np.log(cell_of(m).seen_size) / np.log(m.size_spread) for m in (mismatch, other)]
     np.testing.assert_allclose(*shares)
     np.testing.assert_array_equal(cell_of(other).body_friction, cell_of(Mismatch(friction_spread=2.0)).body_friction)
-
-
-def test_a_lying_box_and_a_body_of_parts_stay_on_the_board():
-    turned = Rotation.from_euler("xyz", [[90.0, 0.0, 20.0], [0.0, 0.0, 70.0]], degrees=True).as_matrix()
-    half = np.array([[0.03, 0.04, 0.08], [0.05, 0.05, 0.05]])
-    scene = Superquadrics(
-        size=jnp.array(half, jnp.float32),
-        exponents=jnp.full((2, 2), 0.2),
-        position=jnp.array([[0.5, 0.1, 0.44], [0.6, -0.1, 0.45]], jnp.float32),
-        rotation=jnp.array(turned, jnp.float32),
-        valid=jnp.ones(2, bool),
-    )
-    factors = np.array([[0.96, 1.05, 1.02], [1.03, 0.97, 1.04]], np.float32)
-    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
-
-    def lowest(objects):
-        corners = signs[None] * np.asarray(objects.size)[:, None]
-        return (np.asarray(objects.position)[:, None] + corners @ turned.transpose(0, 2, 1))[..., 2].min(axis=1)
-
-    larger = resized(scene, Sensing(sizes=factors))
-    np.testing.assert_allclose(larger.size, half * factors, rtol=1e-6)
-    np.testing.assert_allclose(lowest(larger), lowest(scene), atol=1e-6)
-    pieces = empty(2, 2).parts.replace(size=jnp.full((2, 2, 3), 0.02), position=jnp.full((2, 2, 3), 0.01))
-    both = resized(scene.replace(parts=pieces), Sensing(sizes=factors))
-    mean = np.exp(np.log(factors).mean(axis=1))
-    np.testing.assert_allclose(both.parts.size, 0.02 * np.broadcast_to(mean[:, None, None], (2, 2, 3)), rtol=1e-5)
-    np.testing.assert_allclose(both.parts.position, 0.5 * both.parts.size, rtol=1e-5)
-    np.testing.assert_allclose(both.size, half * mean[:, None], rtol=1e-5)
 
 
 @pytest.mark.parametrize("mismatch", [Mismatch(camera_turn=2.0, camera_shift=0.02), Mismatch(shelf_turn=2.0)])
@@ -364,33 +330,6 @@ def test_physics_change_the_model():
     assert changed["soft-friction"].opt.impratio == 1.0
     assert (changed["soft-contacts"].geom_solref[:, 0] > usual.geom_solref[:, 0]).all()
     assert usual.opt.timestep == changed["usual"].opt.timestep == 0.004
-
-
-def seen_in(slots, problem, world, mismatches):
-    """The poses that slots see at once, of a mismatch each."""
-    slots.sense_by({row: Start(SCENE, 0, mismatch=m).sensing(problem) for row, m in enumerate(mismatches)})
-    summary = slots.look(world, jax.random.split(jax.random.key(0), len(mismatches)), range(len(mismatches)))
-    return slots._state.search.observation.objects.position, summary
-
-
-@pytest.mark.slow
-def test_every_slot_senses_by_itself_and_numbers_compile_nothing(problem):
-    mismatches = [Mismatch(camera_shift=0.01, shelf_shift=0.02), Mismatch(camera_shift=0.03)]
-    world = jax.tree.map(lambda a: jnp.stack([a, a]), from_scenario(SCENE))
-    slots = ManySlots(problem, Method().policy(), oracle, world, 2)
-    many, summary = seen_in(slots, problem, world, mismatches)
-    for row, mismatch in enumerate(mismatches):
-        one = OneSlot(problem, Method().policy(), oracle)
-        one.sense_by({0: Start(SCENE, 0, mismatch=mismatch).sensing(problem)})
-        alone = one.look(jax.tree.map(lambda a: a[:1], world), jax.random.split(jax.random.key(0), 1), [0])
-        np.testing.assert_allclose(many[row], one.state.observation.objects.position, atol=1e-6)
-        assert (alone.size[0], alone.truth[0]) == (summary.size[row], summary.truth[row])
-    compiled = _look.jitted._cache_size()
-    other, _ = seen_in(slots, problem, world, [Mismatch(camera_turn=1.0)] * 2)
-    assert np.abs(np.asarray(other - many)).max() > 1e-3
-    assert _look.jitted._cache_size() == compiled
-    with pytest.raises(InputError, match="mismatches of one run that differ in more than numbers"):
-        seen_in(slots, problem, world, [mismatches[0], ASSUMED])
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from test_envs_simulator import pick_and_place, pose, push, scene, standing, take_out
@@ -328,47 +327,6 @@ def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
     assert bool(again.fallen[5, 0])
     assert not bool(again.fallen[5, TARGET])
     assert sim._go_on._cache_size() == compiled
-
-
-@pytest.mark.slow
-def test_a_hand_touches_a_box_as_it_does_in_the_native_simulator(sim):
-    """The same contacts with the same distances and normals, at many moments of a pick-and-place."""
-    single = NativeWorld(config=SimulatorConfig(trace_every=8))
-    single.reset(scene(BOX))
-    single.execute(pick_and_place(pose(0.516, 0.1, 0.08), pose(0.466, 0.22, 0.08)))
-    trace = single.trace
-    bodies = np.concatenate([trace.position, trace.quaternion], axis=-1).reshape(len(trace.time), -1)
-    moments = np.concatenate([trace.q, trace.fingers, bodies], axis=1).astype(np.float32)
-    sim.reset([scene(BOX)] * len(moments))
-    contacts = jax.device_get(jax.jit(sim._model.step)(sim._fields, sim._data.replace(qpos=jnp.asarray(moments)))._impl)
-
-    native, box = single._model, single._model.geom("box0").id
-    touching, odd = 0, []
-    for i, moment in enumerate(moments):
-        data = mujoco.MjData(native)
-        data.qpos[:] = moment
-        mujoco.mj_fwdPosition(native, data)
-        both = np.stack([data.contact.geom1, data.contact.geom2], axis=1)
-        here = np.flatnonzero(contacts.contact__worldid[: contacts.nacon[0]] == i)
-        batch_contacts = (
-            (both, data.contact.dist, data.contact.frame[:, :3]),
-            (contacts.contact__geom[here], contacts.contact__dist[here], contacts.contact__frame[here, 0]),
-        )
-        # Pairs, distances [mm] and normals of what touches the box, but for the board.
-        rows = []
-        for pairs, distance, normal in batch_contacts:
-            of_box = (pairs == box).any(axis=1) & (native.geom_type[pairs] != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
-            value = np.concatenate([pairs, 1e3 * distance[:, None], normal], axis=1)[of_box]
-            rows.append(value[np.lexsort(value[:, 2::-1].T)])
-        touching += len(rows[0])
-        # A contact that is about to begin or to end may be there in one of them only.
-        counts = [len(row) for row in rows]
-        if counts[0] == counts[1]:
-            np.testing.assert_allclose(rows[0], rows[1], atol=5e-3)
-        else:
-            odd.append((i, counts))
-    assert touching > 100
-    assert len(odd) <= 1, odd
 
 
 @pytest.mark.slow

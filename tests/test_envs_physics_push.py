@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
 
-from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.dynamics import named as push_models
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs.pushing import physics_push
@@ -20,8 +19,7 @@ from mechsearch_jax.envs.pushing.pushes import push_simulation
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario, superquadrics
 from mechsearch_jax.geometry import superquadric, transforms
-from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Config, PlannerConfig, initial_belief, search_for_grasp, update_belief
+from mechsearch_jax.planner import Config
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.workspace.shelf import Shelf
@@ -205,53 +203,7 @@ def test_the_batch_simulator_predicts_what_the_native_one_does(outcome):
     np.testing.assert_array_equal(outcomes.scene.position[1], nan.position[None].repeat(2, 0))
 
 
-def seen(problem):
-    """The belief and the observation where the objects of `SCENE` are seen, and the target is not."""
-    observation = Observation(jax.tree.map(lambda a: a[:8], SCENE), jnp.array(False), jnp.zeros(3))
-    return update_belief(problem, initial_belief(problem), observation), observation
-
-
 def pushing(problem):
     """The problem where nothing but pushes can be done."""
     actions = dataclasses.replace(problem.config.actions, actions=("push",))
     return problem.replace(config=dataclasses.replace(problem.config, actions=actions))
-
-
-@pytest.mark.slow
-def test_each_draw_of_a_first_action_is_simulated_once_and_nothing_else(problem, monkeypatch):
-    problem, simulate, calls, redraws_fail = pushing(problem), physics_push.simulate_pushes, [], False
-
-    def counted(*arguments):
-        simulated = simulate(*arguments)
-        calls.append(np.asarray(arguments[-1]))
-        # Sequence 0 never gets an action, and no other one in a second draw.
-        fails = (np.arange(6) == 0) | (len(calls) > 1)
-        return simulated.replace(failed=simulated.failed | fails) if redraws_fail else simulated
-
-    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
-    config, later = PlannerConfig(sequences=6, horizon=2), all_push_models.push_models("physics").later
-    policy = search_for_grasp(config, push_model=NativePhysics(threads=5), later_push_model=later)
-
-    def decided(seed):
-        calls.clear()
-        plan = jax.block_until_ready(policy(jax.random.key(seed), problem, *seen(problem)))
-        return plan, np.stack(calls)
-
-    (plan, simulated), again, other = decided(0), decided(0), decided(1)
-    jax.tree.map(np.testing.assert_array_equal, (plan, simulated), again)
-    assert np.isfinite(plan.value)
-    for _, rows in ((plan, simulated), other):
-        # All sequences at once, and as many calls as the one takes that draws most.
-        assert rows[0].all()
-        assert 1 <= len(rows) <= config.draws[0]
-        assert rows.shape[1:] == (6,)
-        assert (rows[1:] <= rows[:-1]).all()
-
-    redraws_fail = True
-    plan, simulated = decided(0)
-    assert len(simulated) == config.draws[0]
-    assert simulated[0].all()
-    # Those that have an action are not simulated again.
-    has_none = int((plan.sequences.actions.kind[:, 0] == ActionKind.NONE).sum())
-    assert 0 < has_none < 6
-    assert simulated[1:].sum(axis=1).tolist() == [has_none] * (config.draws[0] - 1)

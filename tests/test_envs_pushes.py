@@ -10,24 +10,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.benchmarks.lab.parts.push import repeated
 from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs.pushing import pushes as generator
 from mechsearch_jax.envs.pushing.push_portions import portions
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, from_scenario, superquadrics
-from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.geometry import transforms
 from mechsearch_jax.networks.push import PushConfig
-from mechsearch_jax.networks.push_geometry import push_start
-from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask
 from mechsearch_jax.train.push_scores import (
-    PushTruth,
     average_precision,
     model_scores,
     no_motion,
@@ -45,8 +41,6 @@ DRAW_WORLD = functools.partial(random_world, config=SCENES)
 
 
 WORLDS = 8
-VARIED = jax.jit(jax.vmap(training.varied))
-VARIED_MUCH = jax.jit(jax.vmap(training.varied, in_axes=(0, None, None)))
 
 
 def simulated(seed, rounds):
@@ -264,94 +258,6 @@ def test_the_truth_costs_nothing_but_its_scale(pushes):
     terms = training.example_loss(wrong, truth)
     assert terms["shift"] == pytest.approx(5.0, rel=1e-3)
     assert terms["moves"] > 10
-
-
-@pytest.mark.slow
-def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
-    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
-    start, truth = task.start(on_device), push_truth(on_device)
-    count = len(pushes.object)
-    varied, kept = VARIED(jax.random.split(jax.random.key(0), count), start, truth)
-    np.testing.assert_array_equal(varied.prints.valid, kept.valid)
-    left_out = np.asarray(truth.valid & ~kept.valid)
-    assert left_out.sum() > 5
-    assert not np.any(left_out & np.asarray(truth.moved))
-    # Without them, the same comes of the push, but for what a nudge would change too.
-    shortened = np.flatnonzero(left_out.any(axis=1))
-    fewer = jax.tree.map(lambda a: a[shortened], pushes)
-    fewer = fewer.replace(before=fewer.before.replace(valid=np.asarray(kept.valid)[shortened]))
-    there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[shortened]
-
-    def agreement(again):
-        outcome = repeated(again, NativeSimulator(2, generator.push_simulation()), WORLDS)
-        gap = np.linalg.norm((outcome.scene.position - pushes.after.position[shortened])[..., :2], axis=-1)[there]
-        return np.median(gap), np.mean(gap < 5e-3)
-
-    # That begins at rest, too, where the bodies still moved a little.
-    baseline = agreement(jax.tree.map(lambda a: a[shortened], pushes))
-    median, close = agreement(fewer)
-    assert median < baseline[0] + 5e-4
-    assert close > baseline[1] - 0.15
-
-
-@pytest.mark.slow
-def test_poses_are_blurred_and_nothing_else(pushes):
-    start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
-    start = jax.tree.map(lambda a: a[0], start)
-    keys = jax.random.split(jax.random.key(3), 2000)
-    blurred = jax.vmap(training.blurred, in_axes=(0, None, None))(keys, start, 1e-3)
-    off = np.asarray(blurred.prints.position - start.prints.position[None])
-    turn = np.asarray(blurred.prints.yaw - start.prints.yaw[None])
-    np.testing.assert_allclose(off.std(axis=0), 1e-3, rtol=0.1)
-    np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=1.5e-4)
-    np.testing.assert_allclose(turn.std(axis=0), 1e-3 / 0.08, rtol=0.1)
-    assert abs(np.corrcoef(off[:, 0, 0], turn[:, 0])[0, 1]) < 0.1
-    same = blurred.replace(prints=blurred.prints.replace(position=start.prints.position, yaw=start.prints.yaw))
-    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(start), strict=True):
-        np.testing.assert_array_equal(np.broadcast_to(a, np.shape(a)), np.broadcast_to(b, np.shape(a)))
-    exactly = training.blurred(keys[0], start, 0.0)
-    np.testing.assert_array_equal(exactly.prints.position, start.prints.position)
-
-
-def row_of_boxes(*gaps):
-    """A push of the first of several boxes in a row along y, which moves by 5 cm; nothing becomes of the others.
-
-    There are four slots, so that rows of any length are compiled once.
-    """
-    half = np.float32([0.03, 0.03, 0.05])
-    y = np.cumsum([-0.1, *(gap + 0.06 for gap in gaps)])
-    count = len(y)
-    position = np.stack([np.full(count, 0.6), y, np.full(count, SHELF.board + half[2])], axis=1)
-    scene = superquadric.Superquadrics(
-        size=jnp.asarray(np.tile(half, (count, 1))),
-        exponents=jnp.full((count, 2), 0.2),
-        position=jnp.float32(position),
-        rotation=jnp.broadcast_to(jnp.eye(3), (count, 3, 3)),
-        valid=jnp.ones(count, bool),
-    )
-    T = transforms.make(
-        gripper_rotation(jnp.float32(0.0), jnp.float32(0.5)), jnp.float32([0.6, -0.17, SHELF.board + 0.05])
-    )
-    scene = superquadric.pad(scene, 4)
-    start = push_start(SHELF, scene, push_tables(CONFIG).pusher, T, jnp.float32([0.0, 0.05, 0.0]))
-    moved = jnp.arange(4) == 0
-    shift = jnp.where(moved[:, None], jnp.float32([[0.0, 0.05]]), 0.0)
-    none = jnp.zeros(4)
-    return start, PushTruth(shift, none, moved, none > 0, scene.valid)
-
-
-@pytest.mark.parametrize(
-    # Between circles around the boxes there are 25 mm less than between their sides.
-    ("gaps", "kept"),
-    [((0.2,), [True, False]), ((0.06, 0.02, 0.2), [True, True, True, False])],
-)
-def test_what_may_have_held_something_in_place_is_never_left_out(gaps, kept):
-    start, truth = row_of_boxes(*gaps)
-    keys = jax.random.split(jax.random.key(0), 64)
-    _, left = VARIED_MUCH(keys, start, truth)
-    there = left.valid[:, : len(kept)]
-    np.testing.assert_array_equal(there.all(axis=0), kept)
-    assert there.any(axis=0).all()
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """The planner's eyes: what recognisers make of the simulated world."""
 
-import colorsys
 import types
 
 import jax
@@ -10,9 +9,8 @@ import pytest
 
 from mechsearch_jax.benchmarks.lab.parts.segmentation import numbered
 from mechsearch_jax.envs.camera import recognisers
-from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
 from mechsearch_jax.envs.camera.recognisers import recogniser, true_labels
-from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
+from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, nearest_bodies
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
@@ -207,29 +205,6 @@ def test_a_robot_with_the_same_images_recognises_the_same(world, masks, seen):
     depth, mask = whole(np.asarray(images.depth), np.nan), whole(np.asarray(images.mask), OTHER)
     again = robot(jax.random.key(7), depth, mask=mask, target_id=int(images.target_id))
     jax.tree.map(np.testing.assert_array_equal, again, seen)
-
-
-def test_colours_belong_to_the_scene_and_keep_away_from_the_targets(world):
-    key = scene_key(world)
-    assert (jax.random.key_data(key) == jax.random.key_data(scene_key(moved(world, 0, [0.5, 0.1, 0.5])))).all()
-    taller = world.replace(half_size=world.half_size.at[0, 2].add(0.001))
-    assert (jax.random.key_data(key) != jax.random.key_data(scene_key(taller))).any()
-    target = (0.1, 0.3, 0.8)
-    middle = colorsys.rgb_to_hsv(*target)[0]
-    least = {}
-    for gap in (0.0, 40.0, 120.0):
-        apart = []
-        for seed in range(20):
-            colours = np.asarray(drawn_appearance(jax.random.key(seed), target, gap).colours)
-            assert colours.shape == PALETTE.shape
-            assert colours.min() >= 0.0
-            assert colours.max() <= 1.0
-            np.testing.assert_allclose(colours[TARGET], target, rtol=1e-6)
-            hues = np.array([colorsys.rgb_to_hsv(*rgb)[0] for rgb in colours[:TARGET]])
-            apart += list(180 - np.abs(np.mod(360 * np.abs(hues - middle), 360) - 180))
-        least[gap] = min(apart)
-        assert min(apart) > gap - 0.1
-    assert least[0.0] < 10
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ import math
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -19,7 +18,6 @@ from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.robot import motion
 from mechsearch_jax.robot.arm_config import ARMS, PANDA
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import arm_hits_shelf
@@ -29,7 +27,6 @@ from mechsearch_jax.robot.kinematics import (
     gripper_pose,
     line_kinematics,
 )
-from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
@@ -392,28 +389,6 @@ def test_the_arm_follows_its_reference(sim):
     error = np.minimum(np.linalg.norm(reached - wanted, axis=1), np.linalg.norm(reached - ahead, axis=1))
     assert reachable
     assert error.max() < 1e-3
-
-
-@pytest.mark.slow
-def test_references_are_fixed_in_length_and_continuous():
-    plan = MotionConfig()
-    grasps = jnp.stack([pose(0.6, 0.1, 0.1), pose(0.65, 0.0, 0.08, 0.2), pose(0.5, 0.1, 0.12, -0.1)])
-    places = jnp.stack([pose(0.55, 0.2, 0.1), pose(0.6, 0.1, 0.08, 0.2), pose(0.55, 0.1, 0.12, 0.3)])
-    q7, opening = jnp.full(3, WRISTS[0], jnp.float32), jnp.full(3, 0.08)
-    build = jax.jit(jax.vmap(lambda *a: motion.pick_and_place_reference(*a, plan)))
-    batch, reachable = build(grasps, places, q7, opening)
-    assert reachable.all()
-    assert (batch.q.shape[1] > batch.length).all()
-    assert (batch.length > batch.opens).all()
-    alone = jax.jit(motion.pick_and_place_reference, static_argnums=4)
-    for i in range(3):
-        single, _ = alone(grasps[i], places[i], q7[i], opening[i], plan)
-        np.testing.assert_allclose(batch.q[i], single.q, atol=1e-5)
-        np.testing.assert_allclose(batch.fingers[i], single.fingers, atol=1e-6)
-    assert float(jnp.abs(batch.velocity).max()) * plan.timestep < 0.03
-    np.testing.assert_allclose(batch.q[:, 0], batch.start[:, :7], atol=0.01)
-    closed = simulator.controls(jax.tree.map(lambda a: a[0], batch))
-    assert closed.shape == (int(batch.length[0]), 9)
 
 
 def test_home_is_clear_of_the_shelf():

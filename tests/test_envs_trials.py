@@ -592,29 +592,6 @@ def test_what_is_worth_trying_in_all_slots_is_tried_together(problem):
     assert slots.decide(keys, []) == {}
 
 
-@pytest.mark.slow
-def test_slots_whose_target_is_not_taken_out_plan(problem):
-    _, _, aside = pushes()
-    calls = []
-
-    def trials(problem, scenes, actions, wanted):
-        calls.append(sorted({int(kind) for kind in actions.kind[wanted]}))
-        return MODEL(problem, scenes, actions, wanted)
-
-    rows = [(LOOSE, True), (EDGE, False), (FIRM, True), (OPEN, True)]
-    slots, keys = slots_of(problem, proposes(aside), trials, rows)
-    choices = slots.decide(keys, [0, 1, 2, 3])
-    kinds = [int(choices[row].action.kind) for row in range(4)]
-    assert [kind == ActionKind.RETRIEVE for kind in kinds] == [True, False, False, True]
-    # Plans for a found target and for a hidden one are programs of their own.
-    assert calls == [[ActionKind.RETRIEVE], [ActionKind.PUSH], [ActionKind.PUSH]]
-    for row, (objects, found) in enumerate(rows):
-        belief, observation = look(problem, objects, found)
-        alone = decided(proposes(aside), MODEL, keys[row], problem, belief, observation)
-        assert int(alone.action.kind) == kinds[row]
-        np.testing.assert_allclose(alone.action.T_world_gripper, choices[row].action.T_world_gripper, atol=1e-6)
-
-
 @pytest.mark.parametrize("threads", [1, 3, 16])
 def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(threads):
     made, tried = [], []

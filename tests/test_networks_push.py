@@ -278,39 +278,6 @@ def test_the_distance_between_objects_is_that_of_small_steps():
     assert count >= 2
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_at_cylinders_objects_meet_along_the_line_to_their_axis(yaw):
-    # Two cylinders, 2.4 cm askew; a box, whose right front corner the first meets, and one whose face it meets.
-    scene = standing(
-        ((0.03, 0.03, 0.05), ROUND, 0.6, 0.0, 0.0),
-        ((0.05, 0.05, 0.05), ROUND, 0.8, 0.024, 0.0),
-        ((0.02, 0.02, 0.05), BOX, 0.72, 0.038, 0.0),
-        ((0.02, 0.06, 0.05), BOX, 0.70, -0.05, 0.0),
-    )
-    prints = footprints.footprints(scene)
-    centre = prints.position[:1]
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = jnp.float32([[c, -s], [s, c]])
-    around = jnp.matmul(prints.position - centre, turn.T, precision="highest") + centre
-    prints = prints.replace(position=around, yaw=prints.yaw + yaw)
-    met = jax.jit(contacts.meetings)(prints, turn[:, 0])
-    normal = jnp.matmul(met.normal, turn, precision="highest")
-    along = np.sqrt(0.08**2 - 0.024**2)
-    assert float(met.distance[0, 1]) == pytest.approx(0.2 - along, abs=2e-4)
-    np.testing.assert_allclose(normal[0, 1], [along / 0.08, 0.3], atol=5e-3)
-    # From the corner of the box, 1.8 cm to the left, to the axis.
-    along = np.sqrt(0.03**2 - 0.018**2)
-    assert float(met.distance[0, 2]) == pytest.approx(0.1 - along, abs=4e-4)
-    np.testing.assert_allclose(normal[0, 2], [along / 0.03, 0.6], atol=2e-2)
-    assert float(met.distance[0, 3]) == pytest.approx(0.05, abs=1e-5)
-    np.testing.assert_allclose(normal[0, 3], [1.0, 0.0], atol=1e-5)
-    # A box on its way to a cylinder, to the right of it.
-    heading = -turn[:, 0]
-    back = jax.jit(contacts.meetings)(prints, heading)
-    assert float(back.distance[2, 0]) == pytest.approx(float(met.distance[0, 2]), abs=1e-5)
-    np.testing.assert_allclose(back.normal[2, 0], -met.normal[0, 2], atol=1e-5)
-
-
 def test_cylinders_that_touch_are_not_met_on_the_way_apart():
     # The second is half a millimetre behind the first and to its left.
     away = 0.0805 * np.array([-np.cos(0.5), np.sin(0.5)])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.images import segments as clouds
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
-from mechsearch_jax.images.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
+from mechsearch_jax.images.segments import HIDDEN_EDGE, INNER, OUTLINE
 from mechsearch_jax.networks import recognition as model
 from mechsearch_jax.networks import segmentation as layers
 from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
@@ -29,7 +29,6 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.train import recognition, scenes, segmentation
 from mechsearch_jax.train.loop import CHECKPOINT, SCALARS, TrainConfig, initial_state, learning_rate, train
-from mechsearch_jax.workspace.shelf import Shelf
 
 RECOGNITION = RecognitionConfig(width=32, layers=1, heads=2)
 SEGMENTATION = SegmentationConfig(width=32, layers=2, heads=2, neighbours=8, latents=12)
@@ -222,33 +221,6 @@ def drawn_segments():
     return task, jax.jit(jax.vmap(task.scene))(keys)
 
 
-@pytest.mark.slow
-def test_segments_hold_their_own_points_in_their_frame():
-    task, (_, seen, examples) = drawn_segments()
-    one = jax.tree.map(lambda a: np.asarray(a[0]), examples.segments)
-    labels, points = np.asarray(seen.labels[0]), np.asarray(seen.points[0], float)
-    clouds_of = jax.jit(segment_clouds, static_argnums=1)
-    segments = clouds_of(jax.random.key(1), task.view.camera, seen.points[0], seen.labels[0])
-    assert segments.valid.any()
-    for slot in np.flatnonzero(np.asarray(segments.valid)):
-        turn, origin = np.asarray(segments.T_world_segment[slot, :3, :3], float), segments.T_world_segment[slot, :3, 3]
-        own = points[labels == slot]
-        local = (own - np.asarray(origin)) @ turn
-        mark = np.asarray(segments.mark[slot])
-        of_segment = np.isin(mark, (INNER, OUTLINE, HIDDEN_EDGE))
-        assert segments.pixels[slot] == len(own)
-        distance = np.abs(np.asarray(segments.points[slot])[of_segment][:, None] - local[None]).max(axis=-1).min(axis=1)
-        assert distance.max() < 1e-5
-        assert of_segment.sum() >= task.segments.inner + task.segments.edge
-        assert origin[2] == pytest.approx(Shelf().board)
-        eye = (np.asarray(task.view.camera.position) - np.asarray(origin)) @ turn
-        assert np.allclose(segments.camera[slot], eye, atol=1e-5)
-        assert eye[1] == pytest.approx(0.0, abs=1e-5)
-        assert eye[0] < 0
-        assert np.isin(mark[-task.segments.context :], (CONTEXT, CLEAR)).mean() > 0.9
-    assert one.points.shape == (8, task.segments.points, 3)
-
-
 # --- recognition -----------------------------------------------------------------------------------------------------
 
 
@@ -391,55 +363,6 @@ def test_both_networks_fit_ten_megabytes():
         shapes = jax.eval_shape(task.init, jax.random.key(0))
         total += sum(2 * leaf.size for leaf in jax.tree.leaves(shapes))
     assert total < 9.5e6
-
-
-def damaged(tmp_path, name):
-    path = tmp_path / "w.npz"
-    save_weights(path, "recognition", RECOGNITION, parameters("recognition"), {})
-    card = json.loads(path.with_suffix(".json").read_text())
-    if name == "cut short":
-        path.write_bytes(path.read_bytes()[:-100])
-    elif name == "one bit":
-        data = bytearray(path.read_bytes())
-        data[len(data) // 2] ^= 1
-        path.write_bytes(bytes(data))
-    elif name == "no card":
-        path.with_suffix(".json").unlink()
-    elif name == "no file":
-        path.unlink()
-    elif name == "another shape":
-        card["config"]["width"] = 64
-        path.with_suffix(".json").write_text(json.dumps(card))
-    elif name == "another configuration":
-        card["config"]["depth"] = 3
-        path.with_suffix(".json").write_text(json.dumps(card))
-    elif name == "no number":
-        broken = jax.tree.map(lambda a: a.at[...].set(jnp.nan), parameters("recognition"))
-        save_weights(path, "recognition", RECOGNITION, broken, {})
-    elif name == "no JSON":
-        path.with_suffix(".json").write_text("{")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("cut short", "SHA-256"),
-        ("one bit", "SHA-256"),
-        ("no card", "card"),
-        ("no file", "cannot be read"),
-        ("another shape", "shape"),
-        ("another configuration", "config: .* must hold width"),
-        ("no number", "NaN"),
-        ("no JSON", "card"),
-    ],
-)
-def test_damaged_weights_are_refused_in_one_line(tmp_path, name, reason):
-    path = damaged(tmp_path, name)
-    with pytest.raises(InputError, match=reason) as refused:
-        load_weights(path, "recognition")
-    assert "\n" not in str(refused.value)
-    assert str(tmp_path) in str(refused.value)
 
 
 # --- training --------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 from mechsearch_jax.envs.camera.sensors import SENSORS
 from mechsearch_jax.envs.scenes.generator import outline, separation
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.images.cloud import above_board, cloud_of, draw, resample, shelf_view
+from mechsearch_jax.images.cloud import above_board, cloud_of, resample, shelf_view
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.shapes.primitives import CYLINDER
@@ -128,30 +128,6 @@ def test_scenes_are_as_configured():
     assert np.allclose(worlds.rotation[..., 2, 2], 1.0)
 
 
-@pytest.mark.slow
-def test_drawing_takes_true_elements_evenly():
-    rng = np.random.default_rng(0)
-    chosen = jnp.asarray(rng.random(5000) < 0.3)
-    index, total = draw(jax.random.key(0), chosen, 512)
-    assert total == chosen.sum()
-    assert chosen[index].all()
-    assert (np.diff(index) >= 0).all()
-    assert len(np.unique(index)) > 480
-    every, few = draw(jax.random.key(1), jnp.asarray(np.arange(5000) % 1000 == 7), 64)
-    assert few == 5
-    assert set(np.unique(every)) == {7, 1007, 2007, 3007, 4007}
-    nothing, none = draw(jax.random.key(2), jnp.zeros(100, bool), 8)
-    assert none == 0
-    assert (nothing == 0).all()
-    counts = np.zeros(5000)
-    for key in jax.random.split(jax.random.key(3), 40):
-        np.add.at(counts, np.asarray(jax.jit(draw, static_argnums=2)(key, chosen, 256)[0]), 1)
-    share = counts[np.asarray(chosen)] / 40
-    assert share.mean() == pytest.approx(256 / int(total), rel=1e-6)
-    first, second = np.array_split(share, 2)
-    assert first.mean() == pytest.approx(second.mean(), rel=0.05)
-
-
 def test_the_cloud_is_the_image_without_the_shelf():
     _, seen = clean()
     points = jnp.asarray(seen.points[0])
@@ -205,19 +181,6 @@ def test_time_of_flight_noise_grows_with_slant_and_loses_grazing_returns():
     assert lost[0] < 0.01
     assert lost[1] < 0.05
     assert lost[2] > 0.5
-
-
-def test_time_of_flight_mixes_depths_at_edges_only():
-    camera, near = flat_wall()
-    depth = near.at[:, 80:].set(1.0)
-    measured = TimeOfFlight(deviation=0.0, missing=0.0, mixed=1.0)(jax.random.key(0), camera, depth)
-    forward = jnp.array([row[2] for row in camera.rotation])
-    seen = np.asarray(jnp.sum((measured - jnp.array(camera.position)[None, None]) * forward[None, None], axis=-1))
-    edge = seen[:-1, 79]
-    assert ((edge > 0.8) & (edge < 1.0)).mean() > 0.95
-    assert np.std(edge) == pytest.approx(0.2 / np.sqrt(12), rel=0.25)
-    assert np.allclose(seen[:-1, 1:79], 0.8, atol=1e-5)
-    assert np.allclose(seen[:-1, 81:-1], 1.0, atol=1e-5)
 
 
 def test_scenes_are_taken_by_any_sensor_and_its_card_says_which():

@@ -10,7 +10,6 @@ import pytest
 
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.images.cloud import shelf_view
-from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import no_noise
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.train import scenes
@@ -149,26 +148,6 @@ def test_no_body_is_in_another():
                 # Also not in what fills a vessel up.
                 filled = jax.tree.map(lambda leaf: np.full_like(leaf, leaf is not forms.wall), forms)
                 assert inside(world, filled, scene, b, points).max() < 1e-3, (scene, a, b)
-
-
-def test_labels_are_of_the_bodies_that_points_lie_on():
-    (world, forms, _, space, *_), seen, *_ = drawn()
-    known, beyond = {*range(world.valid.shape[1]), FREE, OTHER, MISSING}, 0
-    for scene in range(COUNT):
-        assert set(np.unique(seen.labels[scene])) <= known
-        assert not (seen.labels[scene] == OTHER).any()
-        for slot in np.unique(seen.labels[scene][seen.labels[scene] >= 0]):
-            points = seen.points[scene][seen.labels[scene] == slot].astype(float)
-            assert world.valid[scene, slot]
-            assert (points[:, 2] > space[scene, 1]).all()
-            assert np.abs(inside(world, forms, scene, slot, points)).max() < 1e-4, (scene, slot)
-        objects = np.delete(np.bincount(seen.labels[scene][seen.labels[scene] >= 0], minlength=13), TARGET)
-        many = world.valid[scene, TARGET + 1 :].any()
-        beyond += many
-        if many:
-            # By all their pixels; those near the board have no label.
-            assert objects[:TARGET].sum() >= objects[TARGET:].sum()
-    assert beyond >= 3
 
 
 def test_the_default_distribution_stays_and_a_key_gives_one_scene():
