@@ -1,6 +1,5 @@
 """Reports: the numbers are those of the rows, in every file, by variant and by scene."""
 
-import collections
 import csv
 import dataclasses
 import io
@@ -15,7 +14,7 @@ from stored_rows import USUAL, row_of
 from mechsearch_jax.benchmarks.report import report, report_bench
 from mechsearch_jax.benchmarks.report.episode_tables import events_summary_table, summary_table
 from mechsearch_jax.benchmarks.report.films import FOLDER
-from mechsearch_jax.benchmarks.report.report import Report, read_tables
+from mechsearch_jax.benchmarks.report.report import Report
 from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
 from mechsearch_jax.benchmarks.report.scene_map import COLOURS, SOMETIMES, WORDS, drawn_files
@@ -24,7 +23,7 @@ from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.preset_names import preset_name
 from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key
-from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, episode_key, identity, write_rows
+from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, episode_key, write_rows
 from mechsearch_jax.envs.world.mismatch import Mismatch
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
@@ -134,18 +133,6 @@ def test_scenarios_that_changed_between_rows_are_named(tmp_path):
     many = [dataclasses.replace(row, scenario=f"s{i}") for i in range(7) for row in (same, other)]
     assert report.changed_scenarios_remark(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
     assert report.changed_scenarios_remark([same]) == ""
-
-
-def test_drawn_rows_are_those_of_a_sweep(tmp_path):
-    rows = report_bench.drawn_rows(4 * 96 * 4)
-    key = Key.of(rows)
-    assert len(key.short) == 96
-    assert key.named(report_bench.REPORTS["with paired differences"][1])
-    assert len({identity(row) for row in rows}) == len(rows)
-    assert set(collections.Counter((row.scenario, row.configuration) for row in rows).values()) == {report_bench.SEEDS}
-    write_rows(rows, tmp_path / "rows.parquet")
-    assert read_tables([tmp_path / "rows.parquet"]) == rows
-    assert rows == report_bench.drawn_rows(len(rows), 0) != report_bench.drawn_rows(len(rows), 1)
 
 
 @pytest.mark.slow

@@ -382,7 +382,7 @@ def test_candidate_poses_do_not_count_once_a_target_is_found_that_stays(decision
     objects, pose = decision[0], (0.7, 0.2, 0.0)
     belief = look(problem, objects, True, pose)
     key = jax.random.key(3)
-    with_all = policies._plan(POLICY._planning, key, problem, belief, seen(objects, True, pose))
+    with_all = policies._plan(POLICY._planning, key, problem, belief, objects)
     alone = POLICY.planned(key, problem, belief, seen(objects, True, pose))
     jax.tree.map(np.testing.assert_array_equal, alone, with_all)
     # One that may be pushed is judged where it would then be.
@@ -423,9 +423,7 @@ def test_the_state_that_a_plan_begins_with_has_the_shapes_of_every_other(decisio
 def test_a_decision_is_the_same_in_the_blocks_of_a_gpu(decision, problem, monkeypatch):
     objects, belief, plan = decision
     monkeypatch.setattr(masked, "on_cpu", lambda: False)
-    again = jax.jit(lambda key: policies._plan.__wrapped__(POLICY, key, problem, belief, seen(objects)))(
-        jax.random.key(0)
-    )
+    again = jax.jit(lambda key: policies._plan.__wrapped__(POLICY, key, problem, belief, objects))(jax.random.key(0))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plan, again)
 
 

@@ -124,8 +124,9 @@ def test_what_a_search_compiles_ahead_is_what_it_calls(problem, monkeypatch, cas
     }
     ((planner, arguments),) = calls.pop("plan")
     assert planner is policy
-    planned = (jax.random.key(0), problem, belief, seen)
-    assert policies._plan._call_key((policy, *arguments), {}) == policies._plan._call_key((policy, *planned), {})
+    *rest, expects = arguments
+    planned, called = ((policy, *rest, expects.objects), (policy, jax.random.key(0), problem, belief, seen.objects))
+    assert policies._plan._call_key(planned, {}) == policies._plan._call_key(called, {})
 
     def keys(each):
         return {name: [(f, f._call_key(args, {})) for f, args in pairs] for name, pairs in each.items()}

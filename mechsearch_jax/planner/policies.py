@@ -144,12 +144,12 @@ class PlanningPolicy(PyTreeNode):
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
     ) -> Callable[[], None] | None:
         """Lower the plan for such arguments without planning; see `runtime.compiled.CachedJit.begin`."""
-        return _plan.begin(self._planning, key, *self._planned_with(problem, belief), observation)
+        return _plan.begin(self._planning, key, *self._planned_with(problem, belief), observation.objects)
 
     @in_own_settings
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
         """Whether the plan for such arguments is compiled; see `runtime.compiled.CachedJit.is_ready`."""
-        return _plan.is_ready(self._planning, key, *self._planned_with(problem, belief), observation)
+        return _plan.is_ready(self._planning, key, *self._planned_with(problem, belief), observation.objects)
 
     @in_own_settings
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
@@ -188,7 +188,7 @@ class PlanningPolicy(PyTreeNode):
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
         unmeasured = {} if observation.measured is None else {"space": _space(problem, belief)}
         grasp = self.grasps(problem.target_grasps, observation.objects, belief.found_pose, *active, **unmeasured)
-        return _retrieval(self, belief, observation, grasp)
+        return _retrieval(self, belief, observation.objects, grasp)
 
     @in_own_settings
     def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
@@ -198,7 +198,7 @@ class PlanningPolicy(PyTreeNode):
           key, problem, belief, observation: as of a `Policy`.
         """
         observation = observation.with_boxes()
-        decision = _plan(self._planning, key, *self._planned_with(problem, belief), observation)
+        decision = _plan(self._planning, key, *self._planned_with(problem, belief), observation.objects)
         if not self.tries:
             return decision
         reached = np.float32(self.objective.reached)
@@ -218,15 +218,15 @@ def _space(problem: Problem, belief: Belief) -> PossibleSpace:
 
 
 @cached_jit()
-def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-    return policy.plan(policy.rollout(problem, belief), key, observation.objects)
+def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, objects: Superquadrics) -> Decision:
+    # Of the objects alone: how sure they are, and what was measured, would make programs of their own.
+    return policy.plan(policy.rollout(problem, belief), key, objects)
 
 
 @cached_jit()
-def _retrieval(policy: PlanningPolicy, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
+def _retrieval(policy: PlanningPolicy, belief: Belief, objects: Superquadrics, grasp: GraspChoice) -> Decision:
     """The decision to take a found target out with a grasp (the first if there are several) if it hits nothing."""
-    reached, objects = policy.objective.reached, observation.objects
-    alternatives = None
+    reached, alternatives = policy.objective.reached, None
     if policy.tries:
         allowed = grasp.feasible if policy.config.retrieval_contact else grasp.success
         alternatives = grasps_to_try(grasp.action, allowed & belief.found, objects, reached)
