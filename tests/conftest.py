@@ -65,6 +65,7 @@ GROUPS = {
         "test_existence",
         "test_envs_verdicts",
         "test_preparing",
+        "test_decisions",
         "test_readme",
         "test_docs",
         "test_doc_blocks",

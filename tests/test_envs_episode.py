@@ -1,11 +1,13 @@
 """The closed loop: verdicts on the true state, failures that cost a step, and a record that says what happened."""
 
 import dataclasses
+import io
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from stage import (
     BOX,
     CYLINDER,
@@ -41,6 +43,7 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.numbering import named_observation
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
 from mechsearch_jax.envs.episode.slots import sizes_and_truths
+from mechsearch_jax.envs.recording.narration import Narrator
 from mechsearch_jax.envs.recording.pictures import frame
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
@@ -457,3 +460,21 @@ def test_the_oracle_leaves_out_what_fell_off_the_board(problem):
     assert not seen.objects.valid.any()
     assert seen.target_visible
     np.testing.assert_allclose(seen.target_pose, [0.62, 0.07, 0.0], atol=1e-6)
+
+
+def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
+    console = Console(record=True, width=200, file=io.StringIO())
+    narrator = Narrator(console, console.status("begins"), problem)
+    episode = run(problem, HIDDEN, Stage(reveal, retrievals=Failure.MISSED), watcher=narrator)
+    narrator.ended(episode)
+    first, *others = console.export_text().split("step 2")
+    narrated = others[0]
+    assert f"no target; it can be at {episode.steps[0].belief_size} of 792 poses" in first
+    assert f"cost {episode.steps[0].cost:.0f} now" in first
+    assert "the target at x" in narrated
+    assert "a grasp that takes it out is known" in narrated
+    assert "failed  the hand missed the target" in narrated
+    assert narrated.strip().endswith(verdict(episode))
+    assert len(narrator.frames) == len(episode.steps)
+    assert [frame.found for frame in narrator.frames] == [False, True, True]
+    assert "the hand missed the target" in narrator.frames[1].caption

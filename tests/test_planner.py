@@ -562,6 +562,7 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
         ({"actions": ()}, "one or more kinds of action"),
+        ({"trials": "guess"}, 'trials "guess" is unknown; use none, physics'),
     ],
 )
 def test_impossible_options_are_refused_with_what_would_do(changes, message):

@@ -21,6 +21,7 @@ from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import make, translate
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import step
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 LEFT = jnp.float32([0.0, 0.1, 0.0])
@@ -218,3 +219,8 @@ def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
     slot.look(world, keys, [0])
     assert [kind for kind, _ in updates] == [0, ActionKind.PUSH, 0]
     assert [before for _, before in updates] == [views[0], views[0], views[2]]
+
+
+def test_an_action_without_what_was_seen_before_it_is_refused(problem):
+    with pytest.raises(InputError, match="or neither"):
+        planner.update_belief(problem, planner.initial_belief(problem), seen(AFTER), action=push())
