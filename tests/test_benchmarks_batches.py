@@ -137,28 +137,6 @@ def test_what_fails_whatever_is_run_ends_the_run(problem, tmp_path, files, monke
     assert sum(row.is_error for row in rows) == 12
 
 
-@pytest.mark.slow
-def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
-    def facts(rows):
-        spent = ("planning_seconds", "simulation_seconds", "compile_seconds")
-        return [dataclasses.replace(row, **dict.fromkeys(spent, 0.0)) for row in rows]
-
-    def stop(row, rows):
-        raise KeyboardInterrupt
-
-    jobs = jobs_of(files)
-    whole = evaluate(jobs, tmp_path / "whole", Batches(worlds=2))
-    out = tmp_path / "killed"
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(jobs, out, Batches(worlds=2), stop)
-    kept = read_rows(out)
-    assert 0 < len(kept) < len(jobs)
-    rows = evaluate(jobs, out, Batches(worlds=2))
-    assert facts(rows) == facts(whole)
-    assert len(read_rows(out)) == len(jobs)
-    assert [row for row in read_rows(out) if row in kept] == kept
-
-
 def test_what_differs_in_numbers_alone_is_one_batch(problem, tmp_path, files, monkeypatch):
     changes = [{"gamma": 0.5}, {"gamma": 0.6}, {"max_steps": 5}, {}]
     methods = [Method(config=PRESETS["standard"](**change)) for change in changes]

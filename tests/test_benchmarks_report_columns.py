@@ -13,9 +13,6 @@ from matplotlib import image
 
 from mechsearch_jax.benchmarks.pages.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report import films
-from mechsearch_jax.benchmarks.report.report import Report, ReportOptions
-from mechsearch_jax.benchmarks.report.report_figures import curve_figure
-from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.statistics.paired import paired
@@ -176,21 +173,6 @@ def test_a_page_is_written_three_ways():
     assert "<p>50% <em>of</em> &lt;all&gt;</p>" in page
     assert "<td>p|q &lt;r&gt;</td>" in page
     assert page.count(long) == text.count(long) == tex.count(long) == 99
-
-
-def test_a_curve_is_over_one_column_with_lines_for_another():
-    rows = rows_of(96)
-    report = Report.of(rows, ReportOptions(curve=["gamma", "choice"]))
-    assert len(report.curve) == 24
-    assert {rates.episodes for rates in report.curve} == {12}
-    axes = curve_figure(report.curve, report.curve_columns, {}).axes
-    assert [len(each.get_lines()) for each in axes] == [4, 4, 4]
-    assert axes[0].get_lines()[0].get_xdata() == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
-    assert "Rates over gamma and choice" in as_markdown(blocks(report))
-    with pytest.raises(InputError, match="give one column, or a second one"):
-        Report.of(rows, ReportOptions(curve=["gamma", "choice", "seed"]))
-    with pytest.raises(InputError, match="method has 96 values"):
-        Report.of(rows, ReportOptions(curve=["gamma", "method"]))
 
 
 def test_the_command_reports_what_its_options_name(tmp_path, monkeypatch, capsys):

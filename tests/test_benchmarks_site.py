@@ -13,7 +13,6 @@ from PIL import Image
 from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.lab.site import gallery, method_pictures, network_pages, set_pictures, store_run
-from mechsearch_jax.benchmarks.lab.site.store_run import run_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.store.rows import episode_key
@@ -168,15 +167,6 @@ def test_a_run_is_read_back_and_says_what_came_of_it(tmp_path, monkeypatch, caps
     assert other["settings"] == {"policy": "search-and-grasp", "recognition": "masks", "gamma": 0.5}
     assert other["drop_free"]["rate"] == 0.0
     assert other["paper_graspable"] is None
-
-
-def test_an_error_reaches_nothing():
-    nothing = {"found_step": None, "graspable_step": None, "retrieved": False, "objects_fallen": None}
-    failed = row_of("c2-4-100", failure="error: no", steps=0, **nothing)
-    (line,) = run_of("x", [failed, row_of("c2-4-101")]).lines
-    assert (line["errors"], line["actions"]) == (1, 3.0)
-    assert {line[name]["rate"] for name in ("found", "graspable", "retrieved", "drop_free")} == {0.5}
-    assert run_of("x", [failed]).lines[0]["actions"] is None
 
 
 def test_parts_of_other_code_and_those_that_disagree_are_refused(tmp_path):

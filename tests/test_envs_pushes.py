@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs.pushing import pushes as generator
 from mechsearch_jax.envs.pushing.push_portions import portions
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
@@ -20,15 +19,11 @@ from mechsearch_jax.geometry import transforms
 from mechsearch_jax.networks.push import PushConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
-from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask
 from mechsearch_jax.train.push_scores import (
     average_precision,
-    model_scores,
-    no_motion,
     planar_turn,
-    push_truth,
 )
 from mechsearch_jax.train.scenes import SceneConfig, random_world
 from mechsearch_jax.workspace.scenario import Body, Scenario
@@ -239,56 +234,6 @@ def test_average_precision_is_the_area_by_hand():
     assert average_precision(score, np.array([1, 0, 1, 0, 0], bool)) == pytest.approx((1 / 1 + 2 / 3) / 2)
     assert average_precision(np.ones(4), np.array([1, 0, 0, 1], bool)) == pytest.approx(0.5)
     assert np.isnan(average_precision(score, np.zeros(5, bool)))
-
-
-@pytest.mark.slow
-def test_the_truth_costs_nothing_but_its_scale(pushes):
-    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
-    sure = jnp.where(truth.moved, 30.0, -30.0)
-    exact = training.PushMotion(
-        shift=truth.shift,
-        turn=truth.turn,
-        moves=sure,
-        topples=jnp.where(truth.toppled, 30.0, -30.0),
-        log_scale=jnp.zeros((*truth.turn.shape, 2)),
-    )
-    terms = training.example_loss(exact, truth)
-    assert max(float(terms[name]) for name in ("shift", "turn", "moves", "topples")) < 2e-3
-    wrong = exact.replace(shift=truth.shift + jnp.array([0.03, 0.04])[None, None], moves=-sure)
-    terms = training.example_loss(wrong, truth)
-    assert terms["shift"] == pytest.approx(5.0, rel=1e-3)
-    assert terms["moves"] > 10
-
-
-@pytest.mark.slow
-def test_a_model_that_knows_the_outcome_scores_best(pushes):
-    after = pushes.after
-
-    # The model recognises a push by where the gripper starts.
-    def oracle(shelf, scene, pusher, T, displacement, q7):
-        row = jnp.argmin(jnp.sum((jnp.asarray(pushes.T_world_gripper)[:, :3, 3] - T[None, :3, 3]) ** 2, axis=1))
-        exact = scene.replace(
-            position=jnp.asarray(after.position)[row],
-            rotation=jnp.asarray(after.rotation)[row],
-        )
-        over = jnp.asarray(pushes.toppled)[row].astype(jnp.float32)
-        return push_model.PushOutcome(exact, exact.valid, jnp.zeros(()), jnp.array(True), over)
-
-    pusher = push_tables(CONFIG).pusher
-    best = model_scores(oracle, pushes, pusher, batch=8)["all"]
-    assert best["pushes"] == len(pushes.object)
-    assert best["pushed_mm"] < 1e-3
-    assert best["pushed_deg"] < 0.05
-    assert best["still"] == 1.0
-    assert best["topple_ap"] in (None, 1.0)
-    idle = model_scores(no_motion, pushes, pusher, batch=8)["all"]
-    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
-    rows = np.arange(len(pushes.object))
-    upright = ~truth.toppled[rows, pushes.object]
-    assert best["pushed_toppled"] == (~upright).sum()
-    assert best["toppled"] == (np.asarray(truth.toppled) & truth.valid).sum()
-    moved = np.linalg.norm(np.asarray(truth.shift)[rows, pushes.object], axis=1)[upright]
-    assert idle["pushed_mm"] == pytest.approx(1e3 * moved.mean(), abs=2e-3)
 
 
 def task_of(pushes: Pushes) -> PushTask:

@@ -11,8 +11,7 @@ from recordings import LOST, MOVES, OBJECTS, RECORDING, SAMPLED, WORLD
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.shapes import Capsule
-from mechsearch_jax.viz import drawing, web
+from mechsearch_jax.viz import drawing
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FPS = 10
@@ -133,22 +132,6 @@ def test_a_panel_shows_the_values_and_what_blocks_the_target(another_server):
     assert node(server, "/blocked/1").visible
     colour = node(server, "/recognised/1/0").color
     np.testing.assert_allclose(colour, 255 * drawing.rgb(drawing.ACTION), atol=1)
-
-
-def test_meshes_are_as_large_as_what_they_show():
-    capsule = Capsule().mesh((0.1, 0.1, 0.3))
-    np.testing.assert_allclose(capsule.bounds, [[-0.1, -0.1, -0.3], [0.1, 0.1, 0.3]], atol=5e-3)
-    box, *rest = web.meshes_of(OBJECTS)
-    low, high = box.vertices.min(axis=0), box.vertices.max(axis=0)
-    np.testing.assert_allclose(high - low, 2 * np.asarray(OBJECTS.size[0]), rtol=1e-3)
-    assert not any(rest)
-    corners = box.vertices[box.faces]
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    away = corners.mean(axis=1) - np.asarray(OBJECTS.position[0])
-    assert (np.einsum("ij,ij->i", outward, away) > -1e-12).all()
-    assert web.arrow_mesh(np.zeros(3), np.array([1e-3, 0.0, 0.0])) is None
-    start, end = np.array([0.5, 0.1, 0.5]), np.array([0.6, 0.1, 0.5])
-    np.testing.assert_allclose(web.arrow_mesh(start, end).vertices[:, 0].max(), 0.6, atol=1e-6)
 
 
 def pixel(browser, server, point):

@@ -290,22 +290,6 @@ def test_cylinders_that_touch_are_not_met_on_the_way_apart():
     assert float(met.distance[1, 0]) == pytest.approx(5e-4 / np.cos(0.5), abs=2e-4)
 
 
-def test_how_two_objects_meet_is_a_feature_of_both():
-    # The gripper is 4 cm before the first, which is 6 cm before the second, whose middle is 2 cm to the left.
-    scene = standing(((0.02, 0.03, 0.05), BOX, 0.6, 0.0, 0.0), ((0.02, 0.02, 0.08), BOX, 0.7, 0.02, 0.0))
-    start = push_start(OPEN, scene, jnp.zeros((1, 3)), gripper_at(0.54, 0.0), jnp.float32([0.15, 0.0, 0.0]))
-    pairs = jax.jit(push_geometry)(start).pairs
-    # onward and back, how far each carries the other, gap, overlap in height, breadth, then along the push: offset,
-    # the normals of either, nothing. All lengths are in units of 10 cm; the second never comes back to the first.
-    ahead = [0.06, REACH, 0.15 - 0.04 - 0.06, 0.0, 0.06, 0.1, 0.03, 0.1]
-    back = [REACH, 0.06, 0.0, 0.15 - 0.04 - 0.06, 0.06, 0.1, 0.03, -0.1]
-    np.testing.assert_allclose(pairs.even[0, 1], [*[10 * a for a in ahead], 1.0, 1.0, 0.0], atol=1e-5)
-    np.testing.assert_allclose(pairs.even[1, 0], [*[10 * a for a in back], 1.0, 1.0, 0.0], atol=1e-5)
-    # Across it: offset, the normals, and the middle of where they overlap, from either.
-    np.testing.assert_allclose(pairs.odd[0, 1], [0.2, 0.0, 0.0, 0.15], atol=1e-5)
-    np.testing.assert_allclose(pairs.odd[1, 0], [-0.2, 0.0, 0.0, -0.05], atol=1e-5)
-
-
 def test_an_object_is_reached_through_another():
     shape = ((0.02, 0.02, 0.05), BOX)
     scene = standing(
