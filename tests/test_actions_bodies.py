@@ -97,7 +97,7 @@ def finger_at(x, y):
 QUASI_STATIC = jax.jit(QuasiStatic(), static_argnums=0)
 
 
-@pytest.fixture(scope="module", params=["quasi-static", "learned"])
+@pytest.fixture(scope="module", params=["learned", pytest.param("quasi-static", marks=pytest.mark.slow)])
 def model(request):
     if request.param == "quasi-static":
         return QUASI_STATIC

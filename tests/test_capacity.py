@@ -81,6 +81,7 @@ def found(objects):
     return (apart < 0.01) & np.asarray(objects.valid)[None]
 
 
+@pytest.mark.slow
 def test_twelve_instances_of_a_mask_are_twelve_objects_in_its_order(look):
     depth, mask = look
     seen = recogniser(16)(KEY, depth, mask=mask, target_id=-1)

@@ -85,6 +85,8 @@ def keys_of(index, count=1):
     return keys_at(data, jnp.full(count, index))
 
 
+@pytest.mark.slow
+@pytest.mark.always
 def test_a_searcher_and_an_episode_decide_the_same_from_the_same_images(problem, images):
     """To the bit, over two steps, trials included, where a robot has no reason to refuse a motion."""
     method = Method()

@@ -190,6 +190,7 @@ def test_a_world_is_simulated_as_its_scenario_is():
 # --- what is kept ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pushes_are_made_once_and_read_again(tmp_path):
     generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
     counts = []

@@ -153,25 +153,13 @@ def test_what_lies_on_the_shelfs_faces_is_the_shelf_whatever_the_mask_says(see, 
     )
 
 
-def test_it_is_a_pytree_for_jit_and_vmap(see, images):
-    """Shapes only: a batch compiles for long."""
+def test_it_is_a_pytree(see, images):
     leaves, structure = jax.tree.flatten(see)
     # What the networks have learned, and where the camera is and what of its image is looked at.
     assert all(isinstance(leaf, jax.Array | float | int) for leaf in leaves)
     again = jax.tree.unflatten(structure, leaves)
     assert jax.tree.structure(again) == jax.tree.structure(Recogniser(setting(images.camera)))
     assert again.camera == images.camera
-
-    def perceive(recogniser, key, depth, colour):
-        return recogniser(key, depth, colour)
-
-    two = jax.vmap(perceive, in_axes=(None, 0, 0, 0))
-    shapes = jax.eval_shape(
-        two, again, jax.random.split(KEY, 2), *(np.stack([a, a]) for a in (images.depth, images.colour))
-    )
-    assert shapes.objects.size.shape == (2, 8, 3)
-    assert (shapes.target_visible.shape, shapes.target_visible.dtype) == ((2,), bool)
-    assert shapes.target_pose.shape == (2, 3)
 
 
 def test_slots_are_callables(images):

@@ -478,6 +478,7 @@ def test_impossible_trainings_are_refused(wrong, reason):
         TrainConfig(**wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_program")
 def test_training_begins_with_the_weights_that_it_is_given(tmp_path):
     task, archive = segmentation.SegmentationTask(network=SEGMENTATION), tmp_path / "segmentation.npz"
