@@ -172,6 +172,7 @@ def test_a_found_target_stands_in_trials_as_what_it_is():
             np.testing.assert_allclose(rests, (0.6, 0.1, SHELF.board + MUG.bottom), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_batch_model_holds_the_target_itself():
     scenes = [hidden(TENT, BOX, yaw=0.5), hidden(TENT, standing(MUG, 0.5, -0.1), x=0.7)]
     factors = np.linspace(0.5, 1.5, BODIES)
