@@ -162,6 +162,7 @@ def test_the_papers_noise_has_its_deviation_in_every_direction():
     assert np.allclose(np.cov(error.T), np.eye(3) * 1e-6 / 3, atol=2e-8)
 
 
+@pytest.mark.slow
 def test_scenes_are_taken_by_any_sensor_and_its_card_says_which():
     config = scenes.SceneConfig(objects=(2, 3), noises=(no_noise, SENSORS["active-stereo"]))
     coarse = shelf_view(stride=8)

@@ -111,6 +111,7 @@ def tops(world, forms, scene):
     return np.where(able, world.position[scene, :, 2] + reach, np.nan)
 
 
+@pytest.mark.slow
 def test_stacked_bodies_stand_on_a_top_beneath_their_middle():
     (world, forms, support, space, *_), *_ = drawn()
     raised = levels = 0
@@ -150,6 +151,7 @@ def test_no_body_is_in_another():
                 assert inside(world, filled, scene, b, points).max() < 1e-3, (scene, a, b)
 
 
+@pytest.mark.slow
 def test_the_default_distribution_stays_and_a_key_gives_one_scene():
     make = jax.jit(lambda key: scenes.random_world(key))
     world = make(jax.random.key(7))
