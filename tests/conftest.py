@@ -65,6 +65,8 @@ GROUPS = {
         "test_existence",
         "test_envs_verdicts",
         "test_preparing",
+        "test_decisions",
+        "test_shelf_as_data",
         "test_readme",
         "test_docs",
         "test_doc_blocks",
@@ -73,7 +75,6 @@ GROUPS = {
     "recognising": (
         "test_envs_recognisers",
         "test_perception_recogniser",
-        "test_shelf_as_data",
         "test_benchmarks_recognition",
     ),
 }

@@ -97,7 +97,7 @@ def finger_at(x, y):
 QUASI_STATIC = jax.jit(QuasiStatic(), static_argnums=0)
 
 
-@pytest.fixture(scope="module", params=["quasi-static", "learned"])
+@pytest.fixture(scope="module", params=["learned", pytest.param("quasi-static", marks=pytest.mark.slow)])
 def model(request):
     if request.param == "quasi-static":
         return QUASI_STATIC
@@ -285,21 +285,3 @@ def test_a_mug_hides_the_target_and_is_moved(problem):
     assert opened.shape == belief.exists.shape
     after = planner.update_belief(problem, belief, seen(decision.predicted), seen(hides), decision.action)
     assert bool(after.exists.any())
-
-
-@pytest.mark.slow
-def test_decisions_about_one_part_bodies_do_not_depend_on_the_room_for_parts(problem):
-    scene = scene_of(
-        block(BEFORE, 0.2, (0.045, 0.03, 0.08)), block((0.6, 0.35)), block((0.58, -0.1), 0.0, exponents=CYLINDER)
-    )
-    policy = planner.search_for_grasp(sequences=16, horizon=2)
-    decided = []
-    for objects in (plain(scene), scene):
-        belief = planner.update_belief(problem, planner.initial_belief(problem), seen(objects))
-        decided.append((belief.exists, policy(jax.random.key(1), problem, belief, seen(objects))))
-    (exists, one), (exists_parts, several) = decided
-    np.testing.assert_array_equal(exists, exists_parts)
-    np.testing.assert_array_equal(one.sequences.actions.kind, several.sequences.actions.kind)
-    np.testing.assert_array_equal(one.sequences.actions.object, several.sequences.actions.object)
-    close(one.action, several.action, 1e-4)
-    close(one.sequences.value, several.sequences.value, 1e-3)

@@ -2,17 +2,14 @@
 
 import contextlib
 import dataclasses
-import functools
 
 import jax
-import numpy as np
 import pytest
-from stage import HIDDEN, OPEN, Stage
+from stage import HIDDEN, OPEN
 
 from mechsearch_jax.benchmarks.running import batches
 from mechsearch_jax.benchmarks.running.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
-from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.store.rows import identity
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.method import Method
@@ -21,7 +18,7 @@ from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
-from mechsearch_jax.planner import PRESETS, policies
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.workspace.scenario import save_scenario
 
 METHOD = Method(config=PRESETS["standard"](max_steps=2))
@@ -86,13 +83,6 @@ def test_where_memory_does_not_suffice_it_goes_on_with_half_the_worlds(problem, 
     assert all(row.failure == "not found" for row in rows)
 
 
-def test_where_memory_does_not_suffice_for_one_world_the_run_ends(problem, tmp_path, files, monkeypatch):
-    stand = Stand(problem, monkeypatch, lambda name, slots: jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: full"))
-    with pytest.raises(jax.errors.JaxRuntimeError, match="full"):
-        evaluate(jobs_of(files[:2]), tmp_path / "rows", Batches(worlds=16))
-    assert stand.slots == [2, 1]
-
-
 def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files, monkeypatch):
     def fail(name, slots):
         return jax.errors.JaxRuntimeError("INTERNAL: no luck") if name == "hidden-1" else None
@@ -102,17 +92,6 @@ def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files
     assert stand.slots == [1, 1]
     assert [row.failure for row in rows if row.scenario == "hidden-1"] == ["error: JaxRuntimeError: INTERNAL: no luck"]
     assert sum(row.failure == "not found" for row in rows) == 3
-
-
-def test_what_fails_in_a_batch_is_a_row_and_the_others_go_on(problem, tmp_path, files, monkeypatch):
-    Stand(problem, monkeypatch, lambda name, slots: ValueError("out of\nluck") if name == "hidden-1" else None)
-    rows = evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
-    assert {r.scenario: r.failure for r in rows} == {
-        "hidden-0": "not found",
-        "open-0": "not found",
-        "hidden-1": "error: ValueError: out of luck",
-        "open-1": "not found",
-    }
 
 
 class Together(Stand):
@@ -158,46 +137,6 @@ def test_what_fails_whatever_is_run_ends_the_run(problem, tmp_path, files, monke
     assert sum(row.is_error for row in rows) == 12
 
 
-def test_a_few_that_fail_are_rows_even_if_nothing_else_is_run(problem, tmp_path, files, monkeypatch):
-    Together(problem, monkeypatch, lambda name, slots: ValueError("never"))
-    rows = evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
-    assert [row.failure for row in rows] == ["error: ValueError: never"] * 4
-
-
-def test_what_fails_before_any_episode_ends_the_run(problem, tmp_path, files, monkeypatch):
-    Stand(problem, monkeypatch)
-
-    def problem_of(self, target, config):
-        raise ValueError("no problem")
-
-    monkeypatch.setattr(batches.Workcell, "problem", problem_of)
-    with pytest.raises(ValueError, match="no problem"):
-        evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
-    assert read_rows(tmp_path / "rows") == []
-
-
-@pytest.mark.slow
-def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
-    def facts(rows):
-        spent = ("planning_seconds", "simulation_seconds", "compile_seconds")
-        return [dataclasses.replace(row, **dict.fromkeys(spent, 0.0)) for row in rows]
-
-    def stop(row, rows):
-        raise KeyboardInterrupt
-
-    jobs = jobs_of(files)
-    whole = evaluate(jobs, tmp_path / "whole", Batches(worlds=2))
-    out = tmp_path / "killed"
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(jobs, out, Batches(worlds=2), stop)
-    kept = read_rows(out)
-    assert 0 < len(kept) < len(jobs)
-    rows = evaluate(jobs, out, Batches(worlds=2))
-    assert facts(rows) == facts(whole)
-    assert len(read_rows(out)) == len(jobs)
-    assert [row for row in read_rows(out) if row in kept] == kept
-
-
 def test_what_differs_in_numbers_alone_is_one_batch(problem, tmp_path, files, monkeypatch):
     changes = [{"gamma": 0.5}, {"gamma": 0.6}, {"max_steps": 5}, {}]
     methods = [Method(config=PRESETS["standard"](**change)) for change in changes]
@@ -213,43 +152,6 @@ def test_what_differs_in_numbers_alone_is_one_batch(problem, tmp_path, files, mo
     stand.slots.clear()
     evaluate(make_jobs(files, others, (0,)), tmp_path / "others", Batches(worlds=30))
     assert stand.slots == [len(files)] * len(others)
-
-
-class QuickStage(Stage):
-    """Nothing happens, under the name of a real simulator."""
-
-    engine = "NativeSimulator"
-
-    def __init__(self, *workcell):
-        super().__init__()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("how", ["batch", "worker"])
-def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
-    """The real policy, with all that is continuous; in worker processes as in batches."""
-    traced, real = [], policies.PlanningPolicy.rollout
-
-    def rollout(policy, problem, belief):
-        traced.append(policy.config.sequences)
-        return real(policy, problem, belief)
-
-    monkeypatch.setattr(policies.PlanningPolicy, "rollout", rollout)
-    monkeypatch.setattr(batches, "new_simulator", QuickStage)
-    values = np.linspace(0.05, 1.0, 96).tolist()
-    small = {"max_steps": 1, "horizon": 2, "sequences": 7 if how == "batch" else 6}
-    methods = [Method(config=PRESETS["standard"](gamma=value, **small)) for value in values]
-    jobs = make_jobs(files[:1], methods, (0,))
-    if how == "batch":
-        rows = evaluate(jobs, tmp_path / "rows", Batches(worlds=2))
-    else:
-        worker = SequentialRunner()
-        worker._simulator = functools.cache(QuickStage)
-        rows = [worker.run(job) for job in jobs]
-    assert len({identity(row) for row in rows}) == 96
-    assert not any(row.is_error for row in rows)
-    # A batch has a program for found targets, too.
-    assert traced == [small["sequences"]] * (2 if how == "batch" else 1)
 
 
 def test_beside_a_gpu_a_batch_tries_actions_out_in_processes_that_end_with_it(monkeypatch):

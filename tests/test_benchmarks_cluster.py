@@ -13,18 +13,15 @@ import pytest
 from scripted import is_gone
 from stage import HIDDEN, OPEN
 
-from mechsearch_jax.benchmarks.running import batches, cluster
-from mechsearch_jax.benchmarks.running.batches import Batches
+from mechsearch_jax.benchmarks.running import cluster
 from mechsearch_jax.benchmarks.running.cluster import MOST_DEATHS, RayCluster, join
 from mechsearch_jax.benchmarks.running.cluster_workers import OnCpus, OnGpus, Worker
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
 from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, Processes
 from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
-from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.commands.options import EpisodeOptions
 from mechsearch_jax.commands.runs import Here, OnRay, RunOptions
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.cores import VARIABLE
 from mechsearch_jax.runtime.errors import InputError
@@ -82,30 +79,6 @@ class Unable(OnCpus):
         raise ImportError("no such library")
 
 
-@dataclasses.dataclass(frozen=True)
-class OnImaginedGpus(OnGpus):
-    """Batches in workers that are given GPUs that there are none of."""
-
-    folder: str = ""
-
-    def runner(self):
-        with open(Path(self.folder) / "gpus", "a") as log:
-            log.write(f"{os.environ['CUDA_VISIBLE_DEVICES']} {os.environ[VARIABLE]}\n")
-        batches.run_episodes, batches.Workcell.problem = at_once, lambda *ignored: None
-        return Batches(self.worlds)
-
-
-def at_once(starts, problem, policy, simulator, slots, listeners, settings):
-    """Stands in for `run_episodes`: all episodes are over at once, but for one that fails."""
-    for place, start in enumerate(starts):
-        scene = start.scenario
-        if scene.name == "bad":
-            raise ValueError("out of luck")
-        config = {**start.options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
-        facts = (scene.name, len(scene.objects), config, {}, (), 0, slots, False, "not found", scene.content_hash)
-        listeners.ended([(place, Episode(*facts))])
-
-
 class Known(SequentialRunner):
     """The real thing, but it tells which process it is."""
 
@@ -158,25 +131,6 @@ def without_times(rows):
 
 
 @pytest.mark.slow
-def test_every_job_becomes_one_row_and_no_file_is_needed(ray, tmp_path):
-    jobs = jobs_of(tmp_path, "one", "two", "three", seeds=range(4))
-    for job in jobs:
-        Path(job.path).unlink(missing_ok=True)
-    begun = Counter()
-    batches = []
-
-    def begin(job):
-        begun[job.key] += 1
-        return job.seed != 2
-
-    scripted(tmp_path, 2)(jobs, batches.append, begin)
-    rows = [row for rows in batches for row in rows]
-    assert sorted(map(episode_key, rows)) == sorted(job.key for job in jobs if job.seed != 2)
-    assert begun == Counter(job.key for job in jobs)
-    assert [row.failure for row in rows] == [None] * 9
-
-
-@pytest.mark.slow
 def test_jobs_of_dead_workers_are_rows_like_the_others(ray, tmp_path):
     names = ("one", "once", "three", "hang", "five")
     jobs = jobs_of(tmp_path, *names)
@@ -196,21 +150,6 @@ def test_jobs_of_dead_workers_are_rows_like_the_others(ray, tmp_path):
 
 
 @pytest.mark.slow
-def test_gpus_run_batches(ray, tmp_path, monkeypatch):
-    jobs = jobs_of(tmp_path, "one", "bad", "three", seeds=range(2))
-    rows = evaluate(jobs, tmp_path / "cluster", RayCluster(OnImaginedGpus(folder=str(tmp_path))))
-    assert set((tmp_path / "gpus").read_text().splitlines()) <= {"0 1", "1 1"}
-    assert [row.failure for row in rows] == [
-        *["not found"] * 2,
-        *["error: ValueError: out of luck"] * 2,
-        *["not found"] * 2,
-    ]
-    monkeypatch.setattr(batches, "run_episodes", at_once)
-    monkeypatch.setattr(batches.Workcell, "problem", lambda *ignored: None)
-    assert without_times(rows) == without_times(evaluate(jobs, tmp_path / "local", Batches(3)))
-
-
-@pytest.mark.slow
 def test_an_episode_that_kills_its_workers_is_a_row_with_the_reason(ray, tmp_path):
     jobs = jobs_of(tmp_path, "one", "crash", "three", "four", "five", "six", "seven", "eight")
     rows = evaluate(jobs, tmp_path / "rows", scripted(tmp_path))
@@ -219,12 +158,6 @@ def test_an_episode_that_kills_its_workers_is_a_row_with_the_reason(ray, tmp_pat
     ]
     assert str(rows[1].failure).startswith(f"error: {MOST_DEATHS} workers died of it, the last one so: The actor ")
     assert ran(tmp_path).count("crash") == MOST_DEATHS
-
-
-@pytest.mark.slow
-def test_what_is_no_episodes_fault_ends_the_run(ray, tmp_path):
-    with pytest.raises(InputError, match=r"^the weights are missing$"):
-        evaluate(jobs_of(tmp_path, "one", "refuse"), tmp_path / "rows", scripted(tmp_path))
 
 
 @pytest.mark.slow
@@ -281,11 +214,6 @@ def test_chunks_are_single_jobs_on_cpus_and_share_a_compilation_on_gpus(tmp_path
 def test_a_worker_with_other_code_is_not_started():
     with pytest.raises(InputError, match=r" has mechsearch-jax 0.*, this machine mechsearch-jax 9.9 \(abc\)"):
         Worker(OnCpus(), "mechsearch-jax 9.9 (abc)")
-
-
-def test_a_worker_without_a_gpu_is_no_worker_for_batches():
-    with pytest.raises(InputError, match=r"pip install 'mechsearch-jax\[gpu\]'"):
-        OnGpus().runner()
 
 
 def test_without_the_library_it_says_how_to_install_it(monkeypatch):

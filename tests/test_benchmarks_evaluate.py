@@ -1,7 +1,6 @@
 """Many episodes: rows as they end, none missing or double, whatever is killed; and failures that are rows."""
 
 import dataclasses
-import io
 import json
 import signal
 import subprocess
@@ -11,16 +10,12 @@ import types
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from scripted import is_gone, one_by_one, run
 
-from mechsearch_jax.benchmarks.report import console_tables
-from mechsearch_jax.benchmarks.report.episode_tables import summary_table
 from mechsearch_jax.benchmarks.running import evaluate as benchmark
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code, shard_of
 from mechsearch_jax.benchmarks.running.processes import Processes
 from mechsearch_jax.benchmarks.statistics.rates import summarise
-from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.benchmarks.store.rows import episode_key, identity
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results
 from mechsearch_jax.envs.episode.method import Method
@@ -57,13 +52,6 @@ def ran(tmp_path):
     return sorted(line.split()[0] for line in (tmp_path / "log").read_text().splitlines())
 
 
-def test_all_combinations_become_rows(tmp_path, files):
-    jobs = make_jobs([files[0], files[1]], [Method(), Method("search-and-grasp")], (0, 1))
-    rows = evaluate(jobs, tmp_path / "rows", one_by_one)
-    assert len(rows) == len({identity(row) for row in rows}) == 8
-    assert sorted(map(identity, read_rows(tmp_path / "rows"))) == sorted(map(identity, rows))
-
-
 def test_a_stopped_run_goes_on_where_it_was(tmp_path, files):
     out = tmp_path / "rows"
     jobs = make_jobs(files, [Method()], (0,))
@@ -82,14 +70,6 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, files):
     (tmp_path / "log").write_text("")
     assert evaluate(jobs, out, one_by_one) == rows
     assert ran(tmp_path) == []
-
-
-def test_rows_of_other_options_stay(tmp_path, files):
-    out = tmp_path / "rows"
-    for gamma in (0.9, 0.5):
-        rows = evaluate(make_jobs(files[:1], [Method(config=standard(gamma=gamma))], (0,)), out, one_by_one)
-        assert [row.gamma for row in rows] == [gamma]
-    assert sorted(row.gamma for row in read_rows(out)) == [0.5, 0.9]
 
 
 @pytest.mark.parametrize(
@@ -255,19 +235,6 @@ def test_a_runner_that_loses_an_episode_raises(tmp_path, files):
 
     with pytest.raises(RuntimeError, match="the episode of one ended without a row of its own"):
         evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows", runner)
-
-
-def test_progress_and_rates_are_shown(tmp_path, files):
-    screen = io.StringIO()
-    console = Console(file=screen, width=100)
-    with console_tables.EpisodeProgress(console, 3) as progress:
-        jobs = make_jobs(files[:3], [Method()], (0,))
-        rows = evaluate(jobs, tmp_path / "rows", one_by_one, ended=progress.ended)
-    console.print(summary_table(summarise(rows), Key.of(rows)))
-    text = screen.getvalue()
-    assert "3/3 raise: the program failed after 0 actions: ValueError: no" in text
-    everything = next(line for line in text.splitlines() if " all " in line)
-    assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.00"]
 
 
 @pytest.mark.slow

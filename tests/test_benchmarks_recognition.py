@@ -1,20 +1,16 @@
 """The comparison of recognisers: what counts, what is lost, and what is written."""
 
 import dataclasses
-import json
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.lab.commands import quality
 from mechsearch_jax.benchmarks.lab.parts import images, recognition, recognition_methods
 from mechsearch_jax.benchmarks.lab.parts.recognition import RecognitionBench, RecognitionRow
 from mechsearch_jax.benchmarks.lab.parts.recognition_methods import Method
-from mechsearch_jax.benchmarks.store.json_rows import save_rows
 from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
@@ -114,11 +110,6 @@ def test_figures_of_rows_by_hand():
     assert recognition.figures([]) == {"objects": 0}
 
 
-def test_objects_fall_into_one_visible_share_each(summary):
-    parts = [summary["clean", "truth", name]["objects"] for name, *_ in recognition.SHARES]
-    assert sum(parts) == summary["clean", "truth", "all"]["objects"]
-
-
 def test_only_objects_with_enough_pixels_count(bench, measured):
     _, image = bench.image(0, "clean")
     rows = [row for row in measured.rows if row.method == "truth" and row.noise == "clean"]
@@ -128,19 +119,6 @@ def test_only_objects_with_enough_pixels_count(bench, measured):
     # In a view with every second ray a pixel stands for four of the full image.
     labels = np.asarray(image.shown.labels)
     assert rows[0].pixels == pytest.approx(4 * np.sum(labels == rows[0].object), rel=0.1)
-
-
-def test_a_file_holds_every_row_and_the_figures_that_follow_from_them(measured, tmp_path):
-    path = tmp_path / "recognition.json"
-    save_rows(measured.value(), measured.rows, path)
-    value = json.loads(path.read_text())
-    rows = tuple(recognition.RecognitionRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
-    assert rows == measured.rows
-    assert value["summary"] == dataclasses.replace(measured, rows=rows).summary()
-    assert set(value["seconds_per_object"]) == set(METHODS)
-    assert value["settings"]["scenario_files"] == 1
-    assert "device" in value["versions"]
-    assert [p.name for p in tmp_path.iterdir()] == ["recognition.json"]
 
 
 @pytest.mark.slow
@@ -153,114 +131,6 @@ def test_held_out_scenes_are_reproducible_and_their_seeds_checked():
     for count, seed in ((-1, 0), (1, -1), (1, 2**31)):
         with pytest.raises(InputError, match=r"--(scenes|seed) -?[0-9]+ must be"):
             images.held_out_scenes(count, seed)
-
-
-def test_methods_bring_along_what_they_begin_with():
-    assert list(recognition.chosen_methods(METHODS, ["mended", "truth", "mended"])) == ["shifted", "mended", "truth"]
-    with pytest.raises(InputError, match='"guess" is unknown'):
-        recognition.chosen_methods(METHODS, ["guess"])
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"scenes": []}, "there are no scenes"),
-        ({"noises": ()}, "at least one noise"),
-        ({"methods": {}}, "one method"),
-        ({"noises": ("fog",)}, '"fog" is unknown'),
-        ({"slow_scenes": 0}, "must be at least 1"),
-    ],
-)
-def test_a_comparison_of_nothing_is_refused(wrong, message):
-    with pytest.raises(InputError, match=message):
-        RecognitionBench(**{"scenes": [SCENE], "methods": METHODS, **wrong})
-
-
-@pytest.mark.parametrize(("slow_scenes", "expected"), [(1, 1), (3, 3), (7, 7), (10, 10), (99, 10), (None, 10)])
-def test_slow_methods_are_measured_on_scenes_spread_over_all(slow_scenes, expected):
-    methods = {"fast": method_of(TRUTH), "slow": Method(shifted, slow=True)}
-    bench = RecognitionBench([SCENE] * 10, methods, slow_scenes=slow_scenes)
-    chosen = [i for i in range(10) if "slow" in bench.methods_for(i)]
-    assert len(chosen) == expected
-    assert chosen[0] == 0
-    assert max(np.diff([*chosen, 10])) <= -(-10 // expected)
-    assert all("fast" in bench.methods_for(i) for i in range(10))
-
-
-def test_two_scenarios_of_one_name_are_refused():
-    scenario = load_scenario(example_scenarios()["first-light"])
-    with pytest.raises(InputError, match="two scenes are called"):
-        images.scenes_of([scenario, scenario])
-
-
-PLACE = """
-[camera]
-width = 160
-height = 90
-fx = 76.2
-fy = 76.2
-cx = 80.0
-cy = 45.0
-
-[shelf]
-left = {left}
-"""
-
-
-def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys):
-    """The command, on generated scenes that are always the same one, with a method that knows the truth."""
-    stood, seen = [], []
-
-    def scenes(count, seed, shelf, source):
-        stood.append(shelf)
-        return [dataclasses.replace(SCENE, source=source)] * count
-
-    def methods(camera, shelf):
-        seen.append((camera, shelf))
-        return {"network": method_of(TRUTH), "network-refined": method_of(TRUTH, after="network")}
-
-    monkeypatch.setattr(images, "held_out_scenes", scenes)
-    monkeypatch.setattr(recognition, "shipped_methods", methods)
-    places = {"wide": 0.6, "wider": 0.7}
-    files = [tmp_path / f"{name}.toml" for name in places]
-    for file, left in zip(files, places.values(), strict=True):
-        file.write_text(PLACE.format(left=left))
-    out = tmp_path / "places.json"
-    measured = {"noise": ("clean",), "method": ("network-refined",), "out": out}
-    quality.bench_recognition(generated=quality.GeneratedScenes(tuple(files), 1), **measured)
-    assert [shelf.left for shelf in stood] == list(places.values())
-    assert [shelf.left for _, shelf in seen] == list(places.values())
-    assert {camera.fx for camera, _ in seen} == {76.2}
-    value = json.loads(out.read_text())
-    rows = [recognition.RecognitionRow(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
-    assert list(dict.fromkeys(row.source for row in rows)) == list(places)
-    assert {name: place["shelf"]["left"] for name, place in value["settings"]["places"].items()} == places
-    assert value["settings"]["held_out_scenes"] == 1
-    assert value["seconds_per_object"] == {}
-    printed = capsys.readouterr().out
-    assert all(f"source {name}, noise clean, method network-refined" in printed for name in places)
-
-
-@pytest.mark.parametrize(
-    ("config", "scenarios", "message"),
-    [
-        (("a/x.toml", "b/x.toml"), (), "two configuration files are called x"),
-        (("x.toml",), ("first-light",), "leave the scenario files out"),
-    ],
-)
-def test_places_without_names_of_their_own_are_refused(config, scenarios, message):
-    with pytest.raises(InputError, match=message):
-        quality.bench_recognition(scenarios, generated=quality.GeneratedScenes(tuple(map(Path, config))))
-
-
-@pytest.mark.slow
-def test_generated_scenes_stand_on_the_given_shelf():
-    shelf = Shelf().moved((0.1, -0.05, 0.2))
-    (scene,) = images.held_out_scenes(1, 0, shelf, "there")
-    (usual,) = images.held_out_scenes(1)
-    shift = np.asarray(scene.world.position - usual.world.position)
-    np.testing.assert_allclose(shift[np.asarray(usual.world.valid)] - (0.1, -0.05, 0.2), 0.0, atol=1e-3)
-    assert (scene.source, usual.source) == ("there", "held-out")
 
 
 @pytest.mark.slow

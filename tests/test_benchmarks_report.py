@@ -1,4 +1,4 @@
-"""Reports: the numbers are those of the rows, in every file, and no two configurations share a line."""
+"""Reports: the numbers are those of the rows, in every file, by variant and by scene."""
 
 import csv
 import dataclasses
@@ -9,16 +9,23 @@ import re
 import pytest
 from matplotlib import image
 from rich.console import Console
+from stored_rows import USUAL, row_of
 
-from mechsearch_jax.benchmarks.report import report
+from mechsearch_jax.benchmarks.report import report, report_bench
 from mechsearch_jax.benchmarks.report.episode_tables import events_summary_table, summary_table
+from mechsearch_jax.benchmarks.report.films import FOLDER
+from mechsearch_jax.benchmarks.report.report import Report
 from mechsearch_jax.benchmarks.report.report_figures import success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
-from mechsearch_jax.benchmarks.statistics.actions_until import reached
+from mechsearch_jax.benchmarks.report.scene_map import COLOURS, SOMETIMES, WORDS, drawn_files
+from mechsearch_jax.benchmarks.statistics.by_scene import ENDS, by_scene, end_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.preset_names import preset_name
 from mechsearch_jax.benchmarks.statistics.rates import summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key
-from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, write_rows
+from mechsearch_jax.benchmarks.store.rows import EVENTS, EpisodeRow, episode_key, write_rows
+from mechsearch_jax.envs.world.mismatch import Mismatch
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
 
 WON = EpisodeRow("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
@@ -36,19 +43,6 @@ ROWS = [WON, LOST, BROKEN, OTHER]
 def page_of(folder):
     """The Markdown page of a report, in which one space is between cells."""
     return re.sub(" +", " ", (folder / "report.md").read_text())
-
-
-def test_goals_are_reached_once_and_for_all():
-    assert reached(ROWS, "found", 4) == [0, 3, 3, 3, 3]
-    assert reached(ROWS, "graspable", 4) == [0, 0, 2, 2, 2]
-    assert reached(ROWS, "retrieved", 4) == [0, 0, 0, 2, 2]
-
-
-def test_failures_are_counted_by_reason():
-    assert report.failures(ROWS) == [
-        report.Failures("search-for-grasp", "found, but not graspable", 1, 1 / 3),
-        report.Failures("search-for-grasp", "error: a | b\nc", 1, 1 / 3),
-    ]
 
 
 def test_a_report_holds_what_the_rows_say(tmp_path):
@@ -91,28 +85,6 @@ def test_the_actions_of_errors_do_not_count(tmp_path):
     assert [line.split()[-3] for line in screen.file.getvalue().splitlines()[-2:]] == ["-", "6.5"]
 
 
-def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
-    said = [dataclasses.replace(WON, paper_graspable=True, paper_graspable_step=2), LOST]
-    write_report([*said, dataclasses.replace(LOST, scenario="c", paper_graspable=False), OTHER], tmp_path)
-    text = page_of(tmp_path)
-    low, high = wilson(1, 2)
-    assert f"| 0.33 (0.06 to 0.79) | 0.50 ({low:.2f} to {high:.2f}) | 0.33 (0.06 to 0.79) |" in text
-    assert "| 1.00 (0.21 to 1.00) | - | 1.00 (0.21 to 1.00) |" in text
-    with open(tmp_path / "rates.csv", newline="") as file:
-        lines = [(line["paper_episodes"], line["paper_graspable"]) for line in csv.DictReader(file)]
-    assert lines == [("0", "")] * 2 + [("2", "0.5")] * 2
-    screen = Console(file=io.StringIO(), width=100)
-    rows = [*said, OTHER]
-    screen.print(summary_table(summarise(rows), Key.of(rows)))
-    assert [line.split()[4:7] for line in screen.file.getvalue().splitlines()[-1:]] == [["0.50", "1.00", "0.50"]]
-
-
-def test_a_report_of_one_success_has_no_failures(tmp_path):
-    write_report([WON], tmp_path)
-    assert "None did." in page_of(tmp_path)
-    assert (tmp_path / "failures.csv").read_text() == "method,reason,episodes,share\n"
-
-
 KNOWN = {
     **dict.fromkeys(EVENTS, 0),
     **{"looks": 4, "truth_lost_step": None, "fallen_step": None, "truth_ruled_out_step": None},
@@ -128,40 +100,6 @@ def test_a_narrow_screen_drops_no_column(table):
     text = screen.file.getvalue()
     lines = [line.split()[1:3] for line in text.splitlines() if line.startswith("standard")]
     assert (lines, "…" in text) == ([["2", "1"], ["8", "1"], ["all", "2"]], False)
-
-
-def test_a_report_says_what_happened_on_the_way(tmp_path):
-    """Of three episodes one does not say it; the others had eight looks together."""
-    fell = "an object fell off the board"
-    rows = [
-        dataclasses.replace(WON, seed=1, **KNOWN),
-        dataclasses.replace(
-            LOST, **{**KNOWN, "truth_lost": 3, "objects_fallen": 2, "fallen_step": 4}, failure=f"{fell} at action 4"
-        ),
-        dataclasses.replace(LOST, seed=2, failure=f"{fell} at action 10"),
-    ]
-    write_report(rows, tmp_path)
-    text = page_of(tmp_path)
-    assert "| search-for-grasp | all | 2 | 0.500 | 0.375 | 0.000 | 0.000 | 0.500 | 0.000 | 0.000 |" in text
-    with open(tmp_path / "events.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert [(line["objects"], line["episodes"], line["fallen"]) for line in lines] == [
-        ("2", "2", "0.5"),
-        ("all", "2", "0.5"),
-    ]
-    assert json.loads((tmp_path / "rates.json").read_text())["events"][1]["truth_lost"] == 0.5
-    assert report.failures(rows) == [report.Failures("search-for-grasp", fell, 2, 2 / 3)]
-    assert events_summary_table(summarise_events(rows), Key.of(rows)).row_count == 2
-    unknown = [dataclasses.replace(row, truth_ruled_out=None) for row in rows]
-    assert [events.texts()[2] for events in summarise_events(unknown)] == ["", ""]
-
-
-def test_rows_of_earlier_versions_have_no_events(tmp_path):
-    write_report(ROWS, tmp_path)
-    assert "These episodes do not say" in page_of(tmp_path)
-    assert (tmp_path / "events.csv").read_text().startswith("method,objects,episodes,truth_lost,")
-    assert json.loads((tmp_path / "rates.json").read_text())["events"] == []
-    assert not summarise_events(ROWS)
 
 
 def test_configurations_do_not_mix():
@@ -195,3 +133,82 @@ def test_scenarios_that_changed_between_rows_are_named(tmp_path):
     many = [dataclasses.replace(row, scenario=f"s{i}") for i in range(7) for row in (same, other)]
     assert report.changed_scenarios_remark(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
     assert report.changed_scenarios_remark([same]) == ""
+
+
+@pytest.mark.slow
+def test_the_command_reports_all_rows():
+    begun = []
+    value = json.loads(json.dumps(report_bench.bench_report(800, begun.append)))
+    assert (value["rows"], value["variants"]) == (800, 96)
+    assert [run["what"] for run in value["runs"]] == list(report_bench.REPORTS) == begun[1:]
+    assert all(run["seconds"] > 0.5 and run["memory"] > 50 and run["bytes"] > 10_000 for run in value["runs"])
+    assert report_bench.timings_table(value).row_count == 2
+
+
+QUIET = {"truth_lost": 0, "restarts": 0, "held_up": 0, "unsettled": 0}
+NEVER = {"found_step": None, "graspable_step": None, "retrieved": False, "steps": 10, "failure": "not found"}
+BLOCKED = {**NEVER, "found_step": 3, "failure": "found, but not graspable"}
+MASKS = dataclasses.replace(USUAL, recognition="masks")
+PAPER = dataclasses.replace(USUAL, config=PRESETS["paper"]())
+METHODS = (USUAL, MASKS, PAPER)
+
+
+def rows_of():
+    """Three variants: the first scene is hard for two of them, the second easy, the third hard for all."""
+    rows = []
+    for method in METHODS:
+        rows.append(row_of("set-4-000", method, **QUIET, **({} if method is USUAL else NEVER)))
+        rows.append(row_of("set-4-001", method, **QUIET))
+        rows.append(row_of("set-8-000", method, **QUIET, **(BLOCKED if method is PAPER else NEVER)))
+    return rows
+
+
+def test_variants_are_called_by_their_presets_and_what_deviates():
+    key = Key.of(rows_of())
+    assert sorted(key.short.values()) == ["paper", "standard", "standard, masks"]
+    assert key.numbered
+    assert [key.short[key.named(text)] for text in ("paper", "standard", "standard, masks", "masks")] == [
+        *("paper", "standard"), *["standard, masks"] * 2,
+    ]  # fmt: skip
+    changed = dataclasses.replace(
+        USUAL,
+        name="random",
+        config=PRESETS["paper"](gamma=0.5),
+        mismatch=Mismatch(friction=0.5),
+    )
+    name = preset_name(changed.options(), str)
+    assert name.preset == "paper"
+    assert set(name.deviations.split(", ")) == {"gamma 0.5", "random", "friction 0.5"}
+
+
+def test_scenes_are_ranked_by_how_hard_they_are_and_seeds_are_averaged_first():
+    again = row_of("set-4-000", MASKS, seed=1)
+    scenes = by_scene([*rows_of(), again])
+    assert [(scene.scenario, round(scene.retrieved, 3)) for scene in scenes] == [
+        *(("set-4-000", 0.5), ("set-4-001", 1.0), ("set-8-000", 0.0)),
+    ]  # fmt: skip
+    assert len(scenes[0].every) == 4
+    assert {end_of(row) for row in rows_of()} == {"retrieved", "found", "hidden"}
+    assert end_of(row_of("set-4-000", **{**NEVER, "failure": "error: out of memory"})) == "error"
+    assert end_of(row_of("set-4-000", retrieved=False, failure="retrieval: missed")) == "graspable"
+    assert set(ENDS) | {SOMETIMES} == set(COLOURS) == set(WORDS)
+
+
+def test_a_report_holds_the_map_and_failures_by_variant(tmp_path):
+    rows = rows_of()
+    (tmp_path / FOLDER).mkdir()
+    drawn = f"{episode_key(rows[0])}.html"
+    (tmp_path / FOLDER / drawn).write_text("a page")
+    report = dataclasses.replace(Report.of(rows), drawn=drawn_files(tmp_path))
+    write_report(report, tmp_path)
+    text, page = ((tmp_path / name).read_text(encoding="utf-8") for name in ("report.md", "report.html"))
+    assert f'<td class=retrieved><a href="{FOLDER}/{drawn}">3</a></td>' in page
+    assert "Scenes by difficulty: see scenes.csv." in text
+    assert re.search(r"\| variant +\| +lost \| +not found \| +found, but not graspable \|", text)
+    assert re.search(r"\| paper +\| +0\.67 \| +0\.33 \| +0\.33 \|", text)
+    assert re.search(r"\| standard, masks +\| standard +\| masks +\|", text)
+    with open(tmp_path / "scenes.csv", newline="") as file:
+        first, *_, last = csv.DictReader(file)
+    assert (first["scenario"], first["standard"], first["paper"]) == ("set-4-000", "1", "0")
+    assert (last["scenario"], float(last["retrieved"])) == ("set-8-000", 0.0)
+    assert "see scenes.csv" in (tmp_path / "report.tex").read_text()

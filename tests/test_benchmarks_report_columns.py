@@ -1,11 +1,9 @@
 """Reports by any columns: labels and their key, paired differences, intervals of steps, pages, and single episodes."""
 
-import csv
 import dataclasses
 import itertools
 import math
 import re
-from html.parser import HTMLParser
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +13,12 @@ from matplotlib import image
 
 from mechsearch_jax.benchmarks.pages.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report import films
-from mechsearch_jax.benchmarks.report.report import Report, ReportOptions
-from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figure, rates_figure, success_figure
-from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES, write_report
-from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.sequential import SequentialRunner
 from mechsearch_jax.benchmarks.statistics.paired import paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
-from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, episode_key, options_of, write_rows
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, options_of, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
@@ -163,91 +157,6 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     assert (by_seed.pairs, by_seed.scenes, by_seed.mean) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
 
 
-def test_a_report_says_which_scenes_were_chosen_on(tmp_path):
-    names = ("published-4-01", "development-box-4-003", "c2-8-089", "c2-8-090", "mine")
-    rows = [dataclasses.replace(WON, scenario=name) for name in names]
-    write_report(rows, tmp_path)
-    said = re.sub(" +", " ", (tmp_path / "report.md").read_text())
-    assert "3 of the 5 episodes are on scenes that settings were chosen on (the published ones," in said
-    write_report(rows[3:], tmp_path)
-    assert "chosen on" not in (tmp_path / "report.md").read_text()
-
-
-@pytest.mark.parametrize("variants", [2, 40])
-def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variants):
-    rows = rows_of(variants, lost=lambda variant, episode: (variant + episode) % 3 == 0)
-    report = Report.of(rows, ReportOptions(curve=["gamma", "guidance"], baseline="V03" if variants > 2 else "choice a"))
-    write_report(report, tmp_path)
-    for name in ("success.png", "rates.png", "curve.png"):
-        height, width = image.imread(tmp_path / name).shape[:2]
-        assert 250 < height < 1300
-        assert 500 < width < 2200
-    drawn = [line for axes in success_figure(rows, report.baseline).axes for line in axes.get_lines()]
-    named = {line.get_label(): line.get_color() for line in drawn if not line.get_label().startswith("_")}
-    assert len(named) == len(set(named.values())) <= len(COLOURS)
-    if variants > 2:
-        assert any(label.startswith("V03, ") for label in named)
-    ticks = rates_figure(report.variants, report.key).axes[-1].get_xticklabels()
-    assert {tick.get_text() for tick in ticks} == set(report.key.short.values())
-    assert {path.name for path in tmp_path.iterdir()} == {*FILES, *OPTIONAL_FILES}
-    # What the options no longer name does not stay.
-    write_report(rows, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == set(FILES)
-
-
-def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
-    rows = rows_of(96, lost=lambda variant, episode: episode == variant % 3)
-    write_report(Report.of(rows, ReportOptions(baseline="V01", paired=["scenario"])), tmp_path)
-    text, page = (re.sub(" +", " ", (tmp_path / name).read_text()) for name in ("report.md", "report.html"))
-    assert len(re.findall(r"^\| [a-d] \| .* \| V\d\d \| all \|", text, re.MULTILINE)) == 96
-    assert "see rates.csv" in text
-    assert "| V96 | 1 | a |" not in text
-    # Rates and actions by number of objects.
-    assert page.count("<details>") == 2
-    with open(tmp_path / "key.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert len(lines) == 96
-    assert (lines[0]["label"], lines[0]["gamma"], lines[0]["push_distances"]) == ("V01", "0.5", "0.1 0.2")
-    with open(tmp_path / "rates.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 96 * 3
-    with open(tmp_path / "paired.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 95 * 9
-
-
-class Checked(HTMLParser):
-    """Elements are closed in order, and nothing comes from elsewhere."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.seen, self.text = [], [], ""
-
-    def handle_starttag(self, tag, attributes):
-        assert all(value.startswith("data:image/png;base64,") for name, value in attributes if name in ("src", "href"))
-        self.seen.append(tag)
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text += data
-
-
-def test_the_page_holds_everything_and_what_is_said_is_no_markup(tmp_path):
-    broken = dataclasses.replace(LOST, scenario="b", failure="error: <b>5 & 6</b> $x_1$ a|b")
-    write_report([WON, broken, dataclasses.replace(WON, policy="my_lab:Mine", scenario="c")], tmp_path)
-    page = Checked()
-    page.feed((tmp_path / "report.html").read_text())
-    assert page.open == []
-    assert page.seen.count("img") == 2
-    assert "error: <b>5 & 6</b> $x_1$ a|b" in page.text
-    tex = (tmp_path / "report.tex").read_text()
-    assert r"error: \textless{}b\textgreater{}5 \& 6\textless{}/b\textgreater{} \$x\_1\$ a\textbar{}b" in tex
-    assert r"my\_lab:Mine & all & 1 & 0 &" in tex
-    assert "a\\|b" in (tmp_path / "report.md").read_text()
-
-
 def test_a_page_is_written_three_ways():
     long = "x" * 100
     table = Table.of(("x", "n"), [("p|q\n<r>", "0.50"), *[(long, 1)] * 99])
@@ -264,21 +173,6 @@ def test_a_page_is_written_three_ways():
     assert "<p>50% <em>of</em> &lt;all&gt;</p>" in page
     assert "<td>p|q &lt;r&gt;</td>" in page
     assert page.count(long) == text.count(long) == tex.count(long) == 99
-
-
-def test_a_curve_is_over_one_column_with_lines_for_another():
-    rows = rows_of(96)
-    report = Report.of(rows, ReportOptions(curve=["gamma", "choice"]))
-    assert len(report.curve) == 24
-    assert {rates.episodes for rates in report.curve} == {12}
-    axes = curve_figure(report.curve, report.curve_columns, {}).axes
-    assert [len(each.get_lines()) for each in axes] == [4, 4, 4]
-    assert axes[0].get_lines()[0].get_xdata() == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
-    assert "Rates over gamma and choice" in as_markdown(blocks(report))
-    with pytest.raises(InputError, match="give one column, or a second one"):
-        Report.of(rows, ReportOptions(curve=["gamma", "choice", "seed"]))
-    with pytest.raises(InputError, match="method has 96 values"):
-        Report.of(rows, ReportOptions(curve=["gamma", "method"]))
 
 
 def test_the_command_reports_what_its_options_name(tmp_path, monkeypatch, capsys):
@@ -299,7 +193,7 @@ def test_the_command_reports_what_its_options_name(tmp_path, monkeypatch, capsys
         cli.parse(["report", "table.parquet", "--paired", "scenario"])()
 
 
-def test_episodes_are_chosen_for_what_they_show(tmp_path):
+def test_episodes_are_chosen_for_what_they_show():
     lost = [
         dataclasses.replace(LOST, scenario=f"l{i}", failure=f"{reason} at action {i}")
         for i, reason in enumerate(["dropped", "dropped", "fell", "dropped", "held up"])
@@ -318,40 +212,6 @@ def test_episodes_are_chosen_for_what_they_show(tmp_path):
     assert [row.failure.partition(" at")[0] for row in by_why[films.LOST]] == ["dropped", "fell", "held up"]
     assert by_why[films.SLOWEST][0] is slow
     assert films.chosen([broken]) == []
-
-    drawn = []
-
-    def draw(row, file):
-        drawn.append(row)
-        if row in lost:
-            raise InputError("no such scenario")
-        file.parent.mkdir(exist_ok=True)
-        file.write_bytes((tmp_path / "report" / "rates.png").read_bytes())
-        return ""
-
-    write_report(rows, tmp_path / "report")
-    shown = films.films(rows, tmp_path / "report", draw)
-    assert len(drawn) == len({episode_key(row) for _, row in chosen})
-    assert [film.drawn for film in shown] == [row not in lost for _, row in chosen]
-    write_report(dataclasses.replace(Report.of(rows), films=shown), tmp_path / "report")
-    page = (tmp_path / "report" / "report.html").read_text()
-    # One variant has no picture of all of them.
-    assert page.count("<img") == 1 + sum(film.drawn for film in shown)
-    assert "no picture: no such scenario" in page
-    assert "Every step of" not in page
-    # A page beside the picture is linked.
-    first = next(film for film in shown if film.drawn)
-    (tmp_path / "report" / first.page).write_text("a page")
-    again = films.films(rows, tmp_path / "report")
-    assert [film.has_page for film in again] == [film.page == first.page for film in again]
-    write_report(dataclasses.replace(Report.of(rows), films=again), tmp_path / "report")
-    assert f'<a href="{first.page}">' in (tmp_path / "report" / "report.html").read_text()
-    assert f"]({first.page})" in (tmp_path / "report" / "report.md").read_text()
-    # What is there is not drawn again.
-    count, paged = len(drawn), [film.row for film in again if film.has_page]
-    films.films(rows, tmp_path / "report", draw)
-    without = {episode_key(row) for _, row in chosen} - {episode_key(row) for row in paged}
-    assert {episode_key(row) for row in drawn[count:]} == without
 
 
 def test_a_method_is_what_its_options_say():

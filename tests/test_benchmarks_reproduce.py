@@ -8,7 +8,6 @@ import re
 import pytest
 from rich.console import Console
 
-from mechsearch_jax import planner
 from mechsearch_jax.benchmarks.paper.paper_tables import (
     BOTH,
     METHODS,
@@ -19,9 +18,6 @@ from mechsearch_jax.benchmarks.paper.paper_tables import (
     table_scenes,
 )
 from mechsearch_jax.benchmarks.paper.reproduce import (
-    ANY,
-    COLLISION_FREE,
-    CONTACT,
     Mean,
     Results,
     Setting,
@@ -29,14 +25,13 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
     screen,
 )
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
-from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, planned_jobs, present_code
+from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, wilson
-from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import reproduce as command
 from mechsearch_jax.envs.scenes.scene_sets import SETS
-from mechsearch_jax.planner import Option
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
@@ -118,11 +113,6 @@ def test_differences_are_over_the_same_episodes():
     # Of both seeds of a, and of b to find alone.
     assert (one.find_steps.value, one.find_steps.count) == (pytest.approx(((1 - 1) / 2 + 0) / 2), 3)
     assert one.grasp_steps == Mean(pytest.approx((-1 - 2) / 2), (None, None), 2)
-
-
-def test_a_scene_that_was_changed_is_no_pair():
-    base, now = row("a", 1, 3, content_hash="0" * 12), row("a", 1, 3, content_hash="1" * 12)
-    assert results({AND: [base], FOR: [now]}).differences() == []
 
 
 def test_settings_are_compared_in_one_thing_at_a_time():
@@ -223,75 +213,6 @@ def test_a_dry_run_says_what_it_would_be(run, tmp_path):
     assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, any" in printed.out
     assert "6 variants, 24 episodes, 0 of them there already, 24 left" in printed.out
     assert re.search(r"^  standard, full, with trials, native simulator: 8 x [\d.]+ s, 2 x ", printed.out, re.M)
-
-
-def test_a_dry_run_knows_what_is_there_and_makes_no_scene(run, tmp_path, monkeypatch):
-    common = ("table3", "--scenes", "2", "--recognition", "oracle", "--preset", "paper")
-
-    def no_files(scenes):
-        raise AssertionError
-
-    monkeypatch.setattr(command, "files_of", no_files)
-    jobs, printed = run(*common, "--seed", "0", "1", "--dry-run")
-    assert not jobs
-    assert "4 episodes: search-for-grasp, oracle" in printed.out
-    scenes = [SceneOutline.of_block(*scene) for scene in table_scenes(TABLES["table3"], (), 2)]
-    settings = command.Cells(recognition=("oracle",), preset=("paper",)).settings(TABLES["table3"])
-    planned = planned_jobs(scenes, list(command._methods(settings, "auto", "NativeSimulator").values()), (0,))
-    rows = [
-        dataclasses.replace(ROW, scenario=job.scene.name, content_hash=job.scene.content_hash, policy=job.method.name)
-        for job in planned
-    ]
-    rows = [
-        dataclasses.replace(
-            row,
-            code=present_code(),
-            configuration=configuration({**job.method.options(), "simulator": job.method.engine}),
-        )
-        for row, job in zip(rows, planned, strict=True)
-    ]
-    with ShardWriter("rows", "me") as writer:
-        writer.append(rows)
-    _, printed = run(*common, "--seed", "0", "1", "--dry-run")
-    assert "2 variants, 8 episodes, 4 of them there already, 4 left" in printed.out
-
-
-def test_cells_without_a_figure_say_that_it_is_not_in_the_paper():
-    rows = [row("a", 1, 2), row("b", None, None)]
-    shown = results({FOR._replace(recognition=seen): rows for seen in ("oracle", "masks", "full")}, "table3")
-    page = markdown(shown, "mechsearch reproduce table3")
-    lines = {line.split("|")[1].strip(): line for line in page.splitlines() if "| both" in line}
-    assert lines["oracle"].count("not in the paper") == 4
-    # The paper does not say in how many of these scenes the target was found.
-    for recognition in ("masks", "full"):
-        assert lines[recognition].count("not in the paper") == 1
-        assert "0.995" in lines[recognition]
-    console = Console(record=True, width=80)
-    console.print(screen(shown))
-    assert re.search(r"^oracle search-for-grasp +2 +2 +0.50/none +0.50/none", console.export_text(), re.MULTILINE)
-
-
-def test_rows_of_several_seeds_are_in_one_table(run, tmp_path):
-    common = ("table3", "--scenes", "2", "--recognition", "oracle", "--preset", "paper")
-    jobs, _ = run(*common, "--seed", "0", "1", "1")
-    assert len(jobs) == 2 * 2 * 2
-    cells = json.loads((tmp_path / "rows" / "table3.json").read_text())["cells"]
-    assert [cell["episodes"] for cell in cells] == [4, 4]
-
-
-def test_collision_free_grasps_are_a_column_of_their_own(monkeypatch):
-    wanted = command.Cells(recognition=("masks",), preset=("standard",))
-    monkeypatch.setattr(planner, "OPTIONS", [option for option in planner.OPTIONS if option.name != CONTACT])
-    with pytest.raises(InputError, match="--retrieval-contact False: this version has no such option"):
-        dataclasses.replace(wanted, retrieval_contact=(False,)).settings(TABLES["table3"])
-    monkeypatch.setattr(planner, "OPTIONS", [*planner.OPTIONS, Option(CONTACT, (), bool, "", None)])
-    settings = dataclasses.replace(wanted, retrieval_contact=(True, False)).settings(TABLES["table3"])
-    assert [setting.grasps for setting in settings] == [ANY, ANY, COLLISION_FREE, COLLISION_FREE]
-    rows = {setting: [row("a", 1, 2), row("b", None, None)] for setting in settings}
-    shown = results(rows, "table3")
-    assert [one.factor for one in shown.differences()] == ["method", "method", "grasps", "grasps"]
-    page = markdown(shown, "mechsearch reproduce table3")
-    assert "## Preset standard, collision-free grasps" in page
 
 
 @pytest.mark.parametrize(

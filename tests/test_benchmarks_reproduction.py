@@ -1,8 +1,5 @@
 """The page of the paper's experiments: it is what the stored runs say, and findings hold by their rules alone."""
 
-import dataclasses
-import random
-import re
 from pathlib import Path
 
 import pytest
@@ -18,11 +15,8 @@ from mechsearch_jax.benchmarks.lab.site.findings import (
     verdicts,
 )
 from mechsearch_jax.benchmarks.lab.site.store_run import run_of
-from mechsearch_jax.benchmarks.lab.site.stored_tables import results_of_runs, setting_of
-from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PICK_AND_PLACE, PUSH, TABLES
-from mechsearch_jax.benchmarks.paper.reproduce import CONTACT, Setting
-from mechsearch_jax.benchmarks.statistics.intervals import wilson
-from mechsearch_jax.benchmarks.store.rows import configuration, options_of
+from mechsearch_jax.benchmarks.lab.site.stored_tables import results_of_runs
+from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, PICK_AND_PLACE, PUSH, TABLES
 from mechsearch_jax.benchmarks.store.runs import write_run
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
@@ -139,107 +133,6 @@ def test_one_kind_of_action_is_compared_with_both():
     assert one.paper == pytest.approx((0.907 + 0.813 + 0.92 + 0.773 - 0.76 - 0.627 - 0.76 - 0.693) / 4)
 
 
-def test_boxes_are_compared_with_other_scenes():
-    def boxes(policy, recognition, actions, objects, number):
-        return 1, 2 if number % 2 else None
-
-    runs = [
-        run_of("boxes", list(rows_of("table5", 40, boxes)), command="reproduce table5"),
-        run_of("cylinders", list(rows_of("table1", 40, lambda *_: (1, 2))), command="reproduce table1"),
-    ]
-    tables = {name: results_of_runs(TABLES[name], runs) for name in ("table1", "table5")}
-    (one,) = verdicts(finding("With 4 objects, boxes"), tables)
-    assert (one.verdict, one.change.value) == (HOLDS, -0.5)
-    # Newcombe's method 10, of 40 scenes a side: the two methods of a scene end alike.
-    low, high = wilson(20, 40)
-    least, _ = wilson(40, 40)
-    assert one.change.interval == pytest.approx(
-        (-0.5 - (0.5 - low), -0.5 + ((high - 0.5) ** 2 + (1 - least) ** 2) ** 0.5), abs=0.01
-    )
-    (other,) = verdicts(finding("With 8 objects, boxes"), tables)
-    assert other.verdict == FAILS
-
-
-def test_what_may_touch_something_counts_as_taken_out_and_is_apart():
-    rows = list(rows_of("table3", 4, lambda *_: (1, None), preset="standard", retrieved=True))
-    free = [
-        dataclasses.replace(
-            row, configuration=configuration({**options_of(row), CONTACT: False, "simulator": "MjxSimulator"})
-        )
-        for row in rows
-    ]
-    run = run_of("x", [*rows, *free], command="reproduce table3")
-    results = results_of_runs(TABLES["table3"], [run])
-    assert {setting.grasps for setting in results.rows} == {"any", "collision-free"}
-    to_grasp = finding("needs fewer actions to grasp")
-    (one,) = verdicts(to_grasp, {"table3": results})
-    # With grasps that touch nothing alone, none was graspable: no actions to compare.
-    assert (one.part, one.goal, one.change.value) == ("preset standard", "retrieved", 0.0)
-
-
-def in_simulator(rows, name):
-    return [
-        dataclasses.replace(row, configuration=configuration({**options_of(row), "simulator": name})) for row in rows
-    ]
-
-
-def test_what_ran_in_another_simulator_is_not_compared():
-    oracle, masks = (list(rows_of("table1", 3, lambda *_: (1, 2), (seen,))) for seen in ("oracle", "masks"))
-    text = finding("Between `masks` and true shapes there is no difference in finding")
-    for simulator, lines in (("NativeSimulator", 1), ("MjxSimulator", 0)):
-        run = run_of("x", [*oracle, *in_simulator(masks, simulator)], command="reproduce table1")
-        results = results_of_runs(TABLES["table1"], [run])
-        assert len(verdicts(text, {"table1": results})) == lines
-        assert {one.factor for one in results.differences()} == {"method", *(["recognition"] * lines)}
-
-
-def test_a_cell_is_of_one_simulator():
-    rows = list(rows_of("table3", 3, lambda *_: (1, 2)))
-    few = in_simulator(rows_of("table3", 2, lambda *_: (3, 4)), "MjxSimulator")
-    results = results_of_runs(TABLES["table3"], [run_of("x", [*few, *rows], command="reproduce table3")])
-    assert [[row.found_step for row in own] for own in results.rows.values()] == [[1, 1, 1]] * 2
-
-
-def test_a_finding_of_one_method_alone_says_so(tmp_path):
-    rows = list(rows_of("table1", 3, lambda *_: (1, 2), ("oracle", "masks")))
-    half = [row for row in rows if (row.recognition, row.policy) != ("masks", METHODS[1])]
-    for kept, text in ((rows, "`masks`: **holds**"), (half, f"`masks`, {METHODS[0]} alone: **holds**")):
-        stored(tmp_path, "table1", kept)
-        assert f"    - preset paper, {text}, found +0.000" in reproduction_page.page(tmp_path)
-
-
-def test_tables_have_no_columns_that_say_nothing(tmp_path):
-    rows = rows_of("table1", 3, lambda *_: (1, 2))
-    stored(tmp_path, "table1", rows)
-    stored(tmp_path, "table4", rows_of("table4", 3, lambda *_: (1, 2)))
-    page = reproduction_page.page(tmp_path)
-    assert "Rows: [table4](../benchmarks/results/runs/table4.jsonl); NativeSimulator." in page
-    before, _, after = page.partition("## Table 4")
-    assert (
-        "| recognition | method | objects | found | paper | graspable | paper | retrieved | "
-        "actions to find | paper | to grasp | paper |\n" in before
-    )
-    assert "| recognition | method | actions | objects | found |" in after
-    stored(tmp_path, "table3", rows_of("table3", 3, lambda *_: (1, 2), preset="standard"))
-    _, _, after = reproduction_page.page(tmp_path).partition("## Table 3")
-    assert "| objects | found | graspable | retrieved | actions to find | paper | to grasp |\n" in after
-
-
-def test_another_folder_is_no_page_without_runs(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        reproduction_page.main(["--runs", str(tmp_path / "none"), "--out", str(tmp_path / "page.md")])
-    assert "none: is no folder; start it at the root of a checkout, or give --runs" in capsys.readouterr().err
-    assert not (tmp_path / "page.md").exists()
-
-
-def test_variants_that_are_no_cells_are_left_out():
-    line = {"preset": "paper", "settings": {"policy": METHODS[0], "recognition": "masks", "actions": list(PUSH)}}
-    assert setting_of(line) == Setting(METHODS[0], "masks", PUSH, "paper")
-    assert setting_of({**line, "settings": {"gamma": 0.5}}) is None
-    assert setting_of({**line, "settings": {"policy": "random"}}) is None
-    assert setting_of({"preset": "standard", "settings": {}}) == Setting(METHODS[1], "oracle", BOTH, "standard")
-
-
 def test_the_newest_run_of_a_cell_counts():
     old, new = (
         [*rows_of("table3", 3, lambda *_, step=step: (step, step), code=code)]
@@ -253,27 +146,3 @@ def test_the_newest_run_of_a_cell_counts():
     )
     # What ran with different code is not compared.
     assert not results.differences()
-
-
-def test_a_page_of_all_tables(tmp_path):
-    draw = random.Random(0)
-
-    def reach(*_):
-        found_step = draw.randrange(6) if draw.random() < 0.9 else None
-        return found_step, None if found_step is None or draw.random() < 0.2 else found_step + 1
-
-    for table in TABLES:
-        stored(tmp_path, table, rows_of(table, 5, reach, ("oracle", "masks")), commit="abc", note="beside others")
-    stored(tmp_path, "table1", rows_of("table1", range(85, 95), reach, preset="standard", objects_fallen=1), "more")
-    page = reproduction_page.page(tmp_path)
-    assert "There are no rows" not in re.sub(".*`mechsearch reproduce table1 --recognition oracle full.*", "", page)
-    assert [f"Table {number}" in page for number in "1345"] == [True] * 4
-    assert "### Table 1, preset standard" in page
-    assert (
-        "| `mechsearch reproduce table3` | abc | this code | cuda: H100 | - | 0 | 20 | 20 | 0 | beside others |" in page
-    )
-    for lines in re.findall(r"(?:^\|.*\|$\n?)+", page, re.MULTILINE):
-        assert len({line.count("|") for line in lines.splitlines()}) == 1
-    assert not re.search(r"\n\n\n", page)
-    assert "Table 1 | 60 | 40 | 20 |" in page
-    assert page == reproduction_page.page(tmp_path)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import stat
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,6 @@ from mechsearch_jax.benchmarks.store.rows import (
     EpisodeRow,
     configuration,
     episode_key,
-    identity,
     parse_row,
     read_rows,
     write_rows,
@@ -31,7 +29,7 @@ from mechsearch_jax.envs.episode.records import Episode, Step, load_episode, rec
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import check_writable, replacing
+from mechsearch_jax.runtime.files import replacing
 from mechsearch_jax.viz.maps import Maps, load_maps, save_maps
 
 PUSH = no_action().replace(
@@ -107,16 +105,6 @@ def test_a_row_says_whether_the_papers_grasps_would_have_done():
         assert (row.paper_graspable, row.paper_graspable_step) == (expected, step)
 
 
-def test_an_episode_has_the_documented_keys(tmp_path):
-    save_episode(EPISODE, tmp_path / "episode.json")
-    value = json.loads((tmp_path / "episode.json").read_text())
-    assert {"scenario", "config", "versions", "steps", "found_step", "graspable_step", "retrieved", "failure"} <= set(
-        value
-    )
-    assert value["steps"][0]["action"]["kind"] == "push"
-    assert value["steps"][0]["action"]["object"] == 3
-
-
 @pytest.mark.parametrize("text", ["{", "[]", "3", '{"steps": [{}]}', '{"steps": []}', "[" * 100_000])
 def test_what_is_no_episode_is_one_line(tmp_path, text):
     (tmp_path / "episode.json").write_text(text)
@@ -142,23 +130,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         fail_halfway()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["episode.json"]
-
-
-def test_a_file_gets_ordinary_permissions(tmp_path):
-    (tmp_path / "plain").write_text("")
-    save_episode(EPISODE, tmp_path / "episode.json")
-    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("plain", "episode.json")}
-    assert len(modes) == 1
-
-
-def test_an_unwritable_place_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    for write in (
-        lambda: save_episode(EPISODE, tmp_path / "file" / "episode.json"),
-        lambda: check_writable(tmp_path / "file"),
-    ):
-        with pytest.raises(InputError, match="cannot be written"):
-            write()
 
 
 def test_maps_are_read_back(tmp_path):
@@ -188,12 +159,6 @@ def test_rows_are_read_back(tmp_path):
     write_rows(rows, tmp_path / "new" / "rows.parquet")
     assert read_rows(tmp_path / "new" / "rows.parquet") == rows
     assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(SCHEMA)
-
-
-def test_what_a_scenario_holds_tells_rows_apart():
-    rows = [dataclasses.replace(ROW, content_hash=content) for content in ("0123456789ab", "ba9876543210")]
-    assert len({identity(row) for row in rows}) == 2
-    assert len({identity(dataclasses.replace(row, steps=7)) for row in rows[:1] * 2}) == 1
 
 
 @pytest.mark.parametrize("text", ["{", "3"])

@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-import json
 import sys
 import types
 
@@ -10,7 +9,6 @@ import pytest
 
 from mechsearch_jax.benchmarks.parts import scaling
 from mechsearch_jax.benchmarks.report.report_bench import drawn_rows
-from mechsearch_jax.benchmarks.running import processes
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
@@ -54,11 +52,6 @@ def workers(monkeypatch):
     monkeypatch.setattr(scaling, "Processes", InTwos)
 
 
-def test_scenes_are_of_all_numbers_of_objects():
-    assert [(block.objects, i) for block, i in scaling.scenes(6)] == [(2, 0), (4, 0), (6, 0), (8, 0), (2, 1), (4, 1)]
-    assert all(block.name.startswith("development") for block, _ in scaling.scenes(6))
-
-
 def test_every_worker_has_a_copy_of_each_scene():
     jobs = scaling._copies(SCENES, 3)
     assert len({job.key for job in jobs}) == len(jobs) == 3 * (len(SCENES) + 1)
@@ -81,33 +74,6 @@ def test_an_episode_that_fails_is_no_measurement(workers, monkeypatch):
     monkeypatch.setattr(scaling, "run_job", lambda job: job.failed("no memory"))
     with pytest.raises(InputError, match="error: no memory"):
         scaling.measure_workers(SCENES, 1, 1, "typed")
-
-
-def test_measurements_are_added_to_a_file(workers, tmp_path):
-    one, two = (scaling.measure_workers(SCENES, count, 2, "typed") for count in (1, 2))
-    scaling.add_measured(one, tmp_path / "new" / "a.jsonl")
-    scaling.add_measured(two, tmp_path / "new" / "a.jsonl")
-    assert scaling.read_measured(tmp_path / "new" / "a.jsonl") == [one, two]
-    lines = [json.loads(line) for line in (tmp_path / "new" / "a.jsonl").read_text().splitlines()]
-    assert [line["episodes_per_second"] for line in lines] == [one.rate, two.rate]
-    (tmp_path / "b.jsonl").write_text('{"case": 3}\n')
-    with pytest.raises(InputError, match="holds no measurements"):
-        scaling.add_measured(one, tmp_path / "b.jsonl")
-
-
-def test_a_worker_has_the_cores_that_it_is_given(monkeypatch):
-    seen = []
-
-    def context(environment):
-        seen.append(environment["MECHSEARCH_CORES"])
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(processes, "_context", context)
-    monkeypatch.setenv("MECHSEARCH_CORES", "8")
-    for runner in (processes.Processes(2), processes.Processes(2, cores=1)):
-        with pytest.raises(ZeroDivisionError):
-            runner(scaling._copies(SCENES, 2), list, bool)
-    assert seen == ["4", "1"]
 
 
 def test_each_gpu_has_a_process_and_its_share_of_the_cores(monkeypatch, tmp_path):
@@ -143,10 +109,3 @@ def test_rows_are_timed_as_they_come(tmp_path):
     assert len(times) == 8
     assert times == sorted(times)
     assert isinstance(read[0], EpisodeRow)
-
-
-@pytest.mark.parametrize("script", ["raise SystemExit('mechsearch: no GPU')", "print('mechsearch: no GPU')"])
-def test_a_command_that_ends_too_early_is_no_measurement(tmp_path, script):
-    commands = [([sys.executable, "-c", script, "--out", str(tmp_path / "out")], {})]
-    with pytest.raises(InputError, match="mechsearch: no GPU"):
-        scaling._times_of_rows(commands, tmp_path, 8, lambda what: None)

@@ -19,8 +19,6 @@ from mechsearch_jax.benchmarks.store.rows import (
     EpisodeRow,
     configuration,
     episode_key,
-    parse_row,
-    read_rows,
     write_rows,
 )
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
@@ -171,17 +169,6 @@ def test_what_an_error_left_open_is_closed_by_who_comes_next(tmp_path, monkeypat
     assert read(tmp_path) == ROWS[:5]
 
 
-def test_after_a_shard_could_not_be_closed_its_writer_goes_on_in_another(tmp_path, monkeypatch):
-    with ShardWriter(tmp_path, "me", rows_per_shard=2) as writer:
-        monkeypatch.setattr(pyarrow.parquet, "write_table", full_disk)
-        with pytest.raises(InputError, match="No space left"):
-            writer.append(ROWS[:2])
-        monkeypatch.undo()
-        writer.append(ROWS[2:3])
-    assert open_shards(tmp_path) == ["shard-me-00000.jsonl"]
-    assert read(tmp_path) == ROWS[:3]
-
-
 def test_what_was_open_as_its_machine_went_down_is_closed_once_it_is_old(tmp_path, monkeypatch):
     with monkeypatch.context() as before:
         before.setattr(claiming, "_machine", lambda: "this machine, before")
@@ -195,18 +182,6 @@ def test_what_was_open_as_its_machine_went_down_is_closed_once_it_is_old(tmp_pat
         claims.close_what_is_left()
     assert open_shards(tmp_path) == []
     assert len(list(tmp_path.glob("*.parquet"))) == 1
-
-
-def test_rows_of_before_decisions_had_a_number_are_read(tmp_path):
-    numbered = [dataclasses.replace(row, decision_version=3) for row in ROWS[:2]]
-    write_rows(numbered, tmp_path / "new.parquet")
-    assert read_rows(tmp_path / "new.parquet") == numbered
-    old = pyarrow.parquet.read_table(tmp_path / "new.parquet").drop_columns("decision_version")
-    pyarrow.parquet.write_table(old, tmp_path / "old.parquet")
-    assert read_rows(tmp_path / "old.parquet") == ROWS[:2]
-    fields = {name: value for name, value in vars(numbered[0]).items() if name != "decision_version"}
-    assert parse_row(json.dumps(fields)) == ROWS[0]
-    assert parse_row(json.dumps(vars(numbered[0]))) == numbered[0]
 
 
 def test_an_episode_is_taken_once(tmp_path):
@@ -239,14 +214,6 @@ def test_what_another_machine_took_is_free_once_it_has_been_silent(tmp_path, mon
         # It wakes up, and does not give up what is no longer its own.
         gone.release("e")
         assert (tmp_path / OPEN / CLAIMS / "e").read_text() == patient.owner
-
-
-def test_a_claim_that_names_nobody_is_free_in_the_end(tmp_path):
-    with Claims(tmp_path, silence=0.1) as claims:
-        (tmp_path / OPEN / CLAIMS / "e").touch()
-        assert not claims.take("e")
-        time.sleep(0.15)
-        assert claims.take("e")
 
 
 # Several processes run the same jobs in one folder. They are killed at random and started again.

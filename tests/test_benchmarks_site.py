@@ -1,23 +1,30 @@
-"""The pages of scene sets are of the declared sets, and pictures show today's scenes."""
+"""Pages that the lab writes are of the stored runs and the declared sets, pictures of today's scenes."""
 
 import dataclasses
+import hashlib
+import json
 import re
-import types
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
-from recordings import RECORDING
-from stored_rows import USUAL, row_of
+from stored_rows import row_of
 
-from mechsearch_jax.benchmarks.lab.site import all_pages, gallery, method_pictures, set_pictures
-from mechsearch_jax.benchmarks.statistics.variants import Key
+from mechsearch_jax.benchmarks.lab.site import gallery, method_pictures, network_pages, set_pictures, store_run
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
+from mechsearch_jax.benchmarks.store.rows import episode_key
+from mechsearch_jax.benchmarks.store.runs import merged, stored_runs
+from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.options import find_scenario
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.page.page import stamp
-from mechsearch_jax.envs.recording.recording import save_recording
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded
+from mechsearch_jax.networks.weights import ARCHITECTURES
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
@@ -56,16 +63,6 @@ def test_pictures_are_of_sets_alone_that_may_be_looked_at():
     assert "report" not in SHOWN
 
 
-def test_the_baseline_of_the_guide_to_many_variants_is_one_of_them():
-    guide = (ROOT / "docs/scale.md").read_text(encoding="utf-8")
-    gammas, policies = re.findall(r"mechsearch sweep .*--gamma ([\d. ]+) --policy ([\w -]+?) --out", guide)[0]
-    (baseline,) = re.findall(r"mechsearch report .*--baseline (\S+)", guide)
-    configs = [USUAL.config.with_options(gamma=float(gamma)) for gamma in gammas.split()]
-    methods = [Method(policy, config) for policy in policies.split() for config in configs]
-    rows = [row_of("development-2-000", method) for method in methods]
-    assert Key.of(rows).named(baseline) == "random, gamma 0.9"
-
-
 @pytest.mark.parametrize("name", method_pictures.PICTURES)
 def test_the_pictures_of_the_method_are_of_the_shipped_scene(name):
     with Image.open(ROOT / method_pictures.OUT / f"{name}.png") as picture:
@@ -73,27 +70,6 @@ def test_the_pictures_of_the_method_are_of_the_shipped_scene(name):
     today = load_scenario(example_scenarios()[method_pictures.SCENE]).content_hash
     assert shows == today, f"run `python -m {method_pictures.__name__}`"
     assert f"](pictures/{name}.png)" in (ROOT / "docs/pictures.md").read_text(encoding="utf-8")
-
-
-def test_steps_that_are_left_out_are_counted():
-    figure = method_pictures.steps(dataclasses.replace(RECORDING, steps=RECORDING.steps * 3))
-    assert figure.get_suptitle() == "The first 6 of 9 steps"
-    assert not method_pictures.steps(RECORDING).get_suptitle()
-
-
-def test_one_command_writes_every_page_that_the_docs_name():
-    text = (ROOT / "CONTRIBUTING.md").read_text()
-    named = set(re.findall(r"`python -m (mechsearch_jax\.benchmarks\.[a-z_.]+(?:page|pages|seconds))\b", text))
-    assert named - {all_pages.__name__} == {write.__module__ for write in all_pages.PAGES.values()}
-
-
-def test_outside_a_checkout_nothing_is_written(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        all_pages.main([])
-    assert end.value.code == 2
-    assert "give the folder of the stored results as --results" in capsys.readouterr().err.splitlines()[-1]
-    assert not list(tmp_path.iterdir())
 
 
 GALLERY = ROOT / "docs/gallery"
@@ -123,42 +99,101 @@ def test_the_index_lists_the_pages_that_are_there():
         assert f'content="mechsearch view --save {stamp()}"' in words, f"{page.name}: {DRAW}"
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("episode = 3", "declares no gallery"),
-        ("[[episode]]\nname = 'a'", "declares no gallery"),
-        ("[[episode]]\nname = 'A b'\ntitle = ''\nshows = ''\nsearch = []", "names are of small letters"),
-    ],
-)
-def test_a_wrong_declaration_is_refused_in_one_line(text, message, tmp_path):
-    (tmp_path / "gallery.toml").write_text(text)
-    with pytest.raises(InputError, match=message) as refused:
-        gallery.declared(tmp_path / "gallery.toml")
-    assert "\n" not in str(refused.value)
+RESULTS, CARDS = ROOT / network_pages.RESULTS, ROOT / network_pages.CARDS
+WRITTEN = {name: (ROOT / network_pages.OUT / f"{name}.md").read_text(encoding="utf-8") for name in ARCHITECTURES}
 
 
-def test_a_gallery_is_drawn_of_the_recordings_that_are_there(tmp_path, monkeypatch, capsys):
-    save_recording(RECORDING, tmp_path / "recordings" / "easy" / "recording.npz")
+def test_every_network_has_figures_and_a_place_in_the_navigation():
+    assert set(network_pages.FIGURES) == set(ARCHITECTURES)
+    navigation = re.findall(r"networks/(.+)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(navigation) == sorted(ARCHITECTURES)
 
-    def run(program, **options):
-        assert program[3:5] == ["view", str(tmp_path / "recordings" / "easy")]
-        cli.parse(program[3:])()
-        return types.SimpleNamespace(returncode=0)
 
-    monkeypatch.setattr(gallery.subprocess, "run", run)
-    gallery.main(["easy", "--out", str(tmp_path), "--recordings", str(tmp_path / "recordings")])
-    text = (tmp_path / "index.md").read_text(encoding="utf-8")
-    assert "[An easy search](easy.html)" in text
-    assert "| retrieved |" in text
-    assert text.count(".html") == 1
-    with pytest.raises(SystemExit):
-        gallery.main(["easy", "--index"])
-    assert "--index writes the list alone" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        gallery.main(["nothing"])
-    assert "nothing is no episode of the gallery; there are easy," in capsys.readouterr().err
-    monkeypatch.setattr(gallery.subprocess, "run", lambda program: types.SimpleNamespace(returncode=3))
-    with pytest.raises(SystemExit):
-        gallery.main(["box", "--out", str(tmp_path)])
-    assert "mechsearch search hidden-box --out" in capsys.readouterr().err
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_the_figures_are_those_of_the_stored_file(name):
+    anew = network_pages.page(name, WRITTEN[name], RESULTS, CARDS)
+    assert anew == WRITTEN[name], f"run `python -m {network_pages.__name__}`"
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_a_page_is_of_the_weights_that_ship_and_of_all_that_trained_them(name):
+    digest = hashlib.sha256((CARDS / f"{name}.npz").read_bytes()).hexdigest()
+    card = json.loads((CARDS / f"{name}.json").read_text(encoding="utf-8"))
+    assert f"`{digest}`" in WRITTEN[name]
+    assert f"{card['parameters']:,} parameters" in WRITTEN[name]
+    commands = []
+    while card:
+        commands.insert(0, card["command"])
+        card = card.get("started_from")
+    assert re.findall(r"^mechsearch train .*$", WRITTEN[name], re.MULTILINE) == commands
+
+
+def test_figures_of_other_weights_are_refused(tmp_path):
+    shutil.copy(CARDS / "push.json", tmp_path)
+    card = json.loads((tmp_path / "push.json").read_text(encoding="utf-8"))
+    (tmp_path / "push.json").write_text(json.dumps({**card, "sha256": "0" * 64}), encoding="utf-8")
+    with pytest.raises(InputError, match=r"push-cpu\.json: is of other weights \(23a87126\w*\) than push\.npz \(0+\)"):
+        network_pages.page("push", WRITTEN["push"], RESULTS, cards=tmp_path)
+
+
+def write(folder, rows, writer="me"):
+    with ShardWriter(folder, writer) as shards:
+        shards.append(rows)
+    return folder
+
+
+def test_a_run_is_read_back_and_says_what_came_of_it(tmp_path, monkeypatch, capsys):
+    rows = [row_of("c2-4-001"), row_of("c2-4-100", found_step=None, graspable_step=None, retrieved=False, steps=10)]
+    paper = Method("search-and-grasp", PRESETS["paper"](gamma=0.5), "masks")
+    rows.append(row_of("c2-4-100", paper, objects_fallen=1, paper_graspable=None))
+    folders = [write(tmp_path / name, part) for name, part in (("a", rows[:2]), ("b", rows[1:]))]
+    arguments = [*map(str, folders), "--name", "two", "--command", "mechsearch evaluate c2", "--commit", "abc"]
+    monkeypatch.setattr(sys, "argv", ["store_run", *arguments, "--out", str(tmp_path / "runs")])
+    store_run.main()
+    assert "two.parquet: 0.0" in capsys.readouterr().out
+    (run,) = stored_runs(tmp_path / "runs")
+    rounded = {episode_key(row): dataclasses.replace(row, planning_seconds=1.23, compile_seconds=0.12) for row in rows}
+    assert {episode_key(row): row for row in run.rows} == rounded
+    one, other = sorted(run.lines, key=lambda line: line["preset"] == "paper")
+    assert (one["run"], one["commit"], one["code"], one["command"]) == ("two", "abc", "this code", arguments[5])
+    assert (one["scene_set"], one["objects"], one["seeds"], one["devices"]) == ("c2", 4, [0], ["cuda: H100"])
+    assert (one["preset"], one["settings"], one["episodes"], one["errors"]) == ("standard", {}, 2, 0)
+    assert (one["scenes"], one["scenes_chosen_on"]) == (2, 1)
+    interval = [round(bound, 4) for bound in wilson(1, 2)]
+    assert one["retrieved"] == one["found"] == {"rate": 0.5, "interval": interval}
+    assert (one["drop_free"]["rate"], one["actions"]) == (1.0, 6.5)
+    assert one["on_scenes_not_chosen_on"]["episodes"] == 1
+    assert one["on_scenes_not_chosen_on"]["retrieved"]["rate"] == 0.0
+    assert other["settings"] == {"policy": "search-and-grasp", "recognition": "masks", "gamma": 0.5}
+    assert other["drop_free"]["rate"] == 0.0
+    assert other["paper_graspable"] is None
+
+
+def test_parts_of_other_code_and_those_that_disagree_are_refused(tmp_path):
+    one = write(tmp_path / "one", [row_of("c2-4-001")])
+    other = write(tmp_path / "other", [row_of("c2-4-002", code="other code")])
+    with pytest.raises(InputError, match=r"run by other code, those of .*one by this code; store them as two runs"):
+        merged([one, other])
+    changed = write(tmp_path / "changed", [row_of("c2-4-001", steps=5, planning_seconds=9.0)])
+    with pytest.raises(InputError, match="'c2-4-001', seed 0, has another steps than the same episode in"):
+        merged([one, changed])
+    (empty := tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no results in this folder"):
+        merged([empty])
+
+
+def test_what_agrees_counts_once_and_an_error_gives_way(tmp_path):
+    good, failed = row_of("c2-4-001"), row_of("c2-4-001", failure="error: no", retrieved=False)
+    again = dataclasses.replace(good, planning_seconds=7.0, device="cuda: H200")
+    folders = [write(tmp_path / str(i), [row]) for i, row in enumerate((failed, good, again, failed))]
+    assert merged(folders) == [good]
+
+
+def test_every_preset_is_its_own_settings():
+    for name, preset in PRESETS.items():
+        options = {**Method(config=preset()).options(), "simulator": "MjxSimulator", "target": "box"}
+        assert settings_of(options) == (name, {})
+        assert settings_of({**options, "gamma": 0.5}) == (name, {"gamma": 0.5})
+    later = Method().options()
+    del later["move_target"]
+    assert settings_of(later) == ("standard", {})

@@ -14,22 +14,14 @@ from stage import HIDDEN, OPEN, TWO
 
 from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks.lab.ceiling import solvability
-from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, read_outcomes, summary
-from mechsearch_jax.benchmarks.lab.screen import as_text
-from mechsearch_jax.benchmarks.statistics.intervals import wilson
-from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
-from mechsearch_jax.benchmarks.store.shards import ShardWriter
+from mechsearch_jax.benchmarks.lab.ceiling.solvability import Ceiling, CeilingRow, Outcomes, summary
 from mechsearch_jax.envs.episode.records import ActionRecord
 from mechsearch_jax.envs.known_target.judgement import Judgement
 from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import load_scenario
 
-EPISODE = EpisodeRow(
-    "two", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.5
-)
 PUSH = ActionRecord("push", 0, np.eye(4).tolist(), [0.0, 0.1, 0.0], np.eye(4).tolist(), 0.7, 0.0)
 
 
@@ -47,47 +39,6 @@ def result_of(start, best=None, actions=None):
     begin = Node(world, (), start)
     reached = begin if best is None else Node(world, (PUSH,), best)
     return KnownSearchResult(actions, reached, begin, 3, 70, Counter())
-
-
-def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_path):
-    table = tmp_path / "rows.parquet"
-    hashed = dataclasses.replace(EPISODE, configuration="{}", content_hash=TWO.content_hash, retrieved=False)
-    write_rows([hashed, dataclasses.replace(hashed, scenario="another name", seed=1, retrieved=True)], table)
-    stored = tmp_path / "stored.json"
-    episodes = [{"scenario": "hidden", "retrieved": True}, {"scenario": "two", "retrieved": True}]
-    stored.write_text(json.dumps({"runs": [{"episodes": episodes}]}))
-    listed = tmp_path / "listed.json"
-    columns = ["scenario", "seed", "retrieved", "content_hash"]
-    runs = [{"episodes": [["two", 0, True, "other"], ["hidden", 0, False, HIDDEN.content_hash]]}]
-    listed.write_text(json.dumps({"columns": columns, "runs": runs}))
-
-    assert read_outcomes([table]).of(TWO) == (2, 1)
-    with ShardWriter(tmp_path / "folder" / "inside", "me") as writer:
-        writer.append([hashed])
-    assert read_outcomes([tmp_path / "folder"]).of(TWO) == (1, 0)
-    assert read_outcomes([stored]).of(TWO) == (1, 1)
-    # The scene of that name held something else.
-    assert read_outcomes([listed]).of(TWO) == (0, 0)
-    everything = read_outcomes([table, stored, listed])
-    assert [everything.of(scene) for scene in (TWO, HIDDEN, OPEN)] == [(3, 2), (2, 1), (0, 0)]
-    assert read_outcomes([]).of(TWO) == (0, 0)
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("{", "is not JSON"),
-        ("[]", "there are no episodes"),
-        ('{"runs": []}', "there are no episodes"),
-        ('{"runs": [{"episodes": [["a"]]}]}', "is no stored result"),
-        ('{"runs": [3]}', "is no stored result"),
-        ('{"runs": [{"episodes": [{"scenario": "a"}]}]}', "is no stored result"),
-    ],
-)
-def test_what_holds_no_episodes_is_refused(tmp_path, text, complaint):
-    (tmp_path / "stored.json").write_text(text)
-    with pytest.raises(InputError, match=rf"stored.json: .*{complaint}"):
-        read_outcomes([tmp_path / "stored.json"])
 
 
 @pytest.fixture
@@ -131,29 +82,6 @@ def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, mon
     other = Ceiling(tmp_path, KnownSearchConfig(rounds=4))
     assert other.settings != ceiling.settings
     assert ceiling.searched == ["two", "hidden", "hidden", "two"]
-
-
-def test_shares_are_those_of_the_rows(tmp_path):
-    row = CeilingRow("a", "00", 2, 4, 1, True)
-    rows = [
-        row,
-        dataclasses.replace(row, scenario="b", retrieved=0, actions=3, rounds=1, simulated=9, seconds=1.0),
-        dataclasses.replace(row, scenario="c", retrieved=0, solvable=False, reason="too tight"),
-        dataclasses.replace(row, scenario="d", objects=8),
-    ]
-    two, eight, everything = summary(rows)
-    assert (two["objects"], eight["objects"], everything["objects"]) == (2, 8, None)
-    assert (two["scenes"], two["solved_in_an_episode"], two["solved_by_the_search"]) == (3, 1, 1)
-    assert two["solvable"] == pytest.approx(2 / 3)
-    assert everything["solvable_interval"] == wilson(3, 4)
-    solvability.save_ceiling(rows, {"rounds": 3}, "mechsearch bench ceiling", tmp_path / "ceiling.json")
-    value = json.loads((tmp_path / "ceiling.json").read_text())
-    assert [CeilingRow(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
-    assert (value["command"], value["settings"]) == ("mechsearch bench ceiling", {"rounds": 3})
-    assert as_text(summary(rows)[:1]) == (
-        "objects 2, scenes 3, solved_in_an_episode 1, solved_by_the_search 1, solvable 0.6667, "
-        f"solvable_interval {two['solvable_interval'][0]:.4g} to {two['solvable_interval'][1]:.4g}"
-    )
 
 
 RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "ceiling-cpu.json"

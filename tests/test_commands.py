@@ -4,21 +4,17 @@ import dataclasses
 import importlib.metadata
 import json
 import os
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mechsearch_jax.benchmarks.lab import __main__ as lab
-from mechsearch_jax.benchmarks.report.report_files import FILES
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import options
-from mechsearch_jax.envs.episode.records import Episode, save_episode
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.runtime.errors import InputError
@@ -78,12 +74,7 @@ def folder(tmp_path):
 
 WRONG = {
     "no command": ([], "Expected one of"),
-    "unknown command": (
-        ["frobnicate"],
-        'there is no command "mechsearch frobnicate"; known are search, plan, calibrate, inspect',
-    ),
     "mistyped command": (["serch"], "did you mean search? (mechsearch --help tells more)"),
-    "mistyped command of a group": (["bench", "plam"], "did you mean plan? (mechsearch bench --help tells more)"),
     "mistyped option": (
         ["search", "good.json", "--out", "out", "--gama", "1"],
         "--gama, 1; did you mean --gamma? (mechsearch search --help tells more)",
@@ -92,7 +83,6 @@ WRONG = {
         ["inspect", "first-light", "--out", "maps", "--world", "friction=2"],
         "inspect: simulates no world that could differ; leave --world and --sensor out",
     ),
-    "help of the subcommand": (["bench", "plan", "--batch", "x"], "(mechsearch bench plan --help tells more)"),
     "no configuration file": (["search", "good.json", "--out", "out", "--config", "none.toml"], "none.toml: cannot be"),
     "configuration of a set": (
         ["scenarios", "generate", "--set", "d1", "--config", "good.toml", "--out", "new"],
@@ -103,33 +93,20 @@ WRONG = {
     "no number": (["search", "good.json", "--out", "out", "--gamma", "high"], "--gamma"),
     "unknown push model": (["search", "good.json", "--out", "out", "--push-model", "guess"], "'guess'"),
     "impossible gamma": (["search", "good.json", "--out", "out", "--gamma", "1.5"], "gamma 1.5 is outside (0, 1]"),
-    "impossible horizon": (["inspect", "good.json", "--out", "out", "--horizon", "0"], "horizon 0 must be at least 1"),
     "no output": (["search", "good.json"], "--out"),
     "nothing to search": (["search", "--out", "out"], "either a scenario or --objects"),
-    "both to search": (["search", "good.json", "--objects", "3", "--out", "out"], "either a scenario or --objects"),
-    "target of a file": (["search", "good.json", "--target", "box", "--out", "out"], "--target is for a generated"),
     "too many objects": (["search", "--objects", "9", "--out", "out"], "9 is not between 1 and 8"),
-    "negative seed": (["search", "--objects", "2", "--seed", "-1", "--out", "out"], "-1"),
     "missing file": (["search", "none.json", "--out", "out"], "none.json: there is no such file"),
     "malformed file": (["search", "broken.json", "--out", "out"], "broken.json: is not JSON"),
-    "bad size": (["search", "negative.json", "--out", "out"], "negative.json: objects[0].half_size"),
     "bad among good": (["inspect", "good.json", "negative.json", "--out", "out"], "negative.json: objects[0]"),
-    "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
-    "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
     "results in a file": (
         ["evaluate", "good.json", "--out", "out/rows.parquet"],
         "rows.parquet: results are kept in a folder, not in a file",
     ),
     "no worker": (["evaluate", "good.json", "--out", "new", "--workers", "0"], "--workers 0"),
-    "no shard": (["evaluate", "good.json", "--out", "new", "--shard", "3/2"], "--shard 3/2 is not K/N"),
     "half a shard": (["evaluate", "good.json", "--out", "new", "--shard", "1"], "--shard 1 is not K/N"),
-    "no time": (["evaluate", "good.json", "--out", "new", "--time-limit", "0"], "--time-limit 0 must be"),
     "no cluster": (["evaluate", "good.json", "--out", "new", "--cluster", "slurm"], "--cluster slurm is unknown; give"),
-    "a cluster's client": (
-        ["evaluate", "good.json", "--out", "new", "--cluster", "ray://a:1"],
-        "give ray, ray:auto or",
-    ),
     "what a cluster would take": (
         ["evaluate", "good.json", "--out", "new", "--cluster", "ray", "--dry-run"],
         "--dry-run tells of runs on this machine; leave --cluster out",
@@ -138,104 +115,34 @@ WRONG = {
         ["sweep", "good.json", "--out", "new", "--cluster", "ray", "--workers", "1", "--simulator", "mjx"],
         "--workers run the native simulator",
     ),
-    "time of a batch": (
-        ["evaluate", "good.json", "--out", "new", "--batch", "2", "--time-limit", "9"],
-        "--time-limit is for worker processes",
-    ),
-    "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
     "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
     "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
-    "best preset": (["search", "good.json", "--out", "out", "--preset", "finest"], "'finest'"),
     "both method and policy": (
         ["search", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
         "search: give either --method or --policy, not both",
     ),
-    "both methods and policies": (
-        ["evaluate", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
-        "evaluate: give either --method or --policy, not both",
-    ),
-    "unknown method": (["search", "good.json", "--out", "out", "--method", "random"], "'random'"),
     "unknown policy": (["search", "good.json", "--out", "out", "--policy", "guess"], 'policy "guess"'),
-    "missing policy": (["evaluate", "good.json", "--out", "new", "--policy", "nobody.there:Mine"], "nobody"),
-    "unknown subject": (["bench", "speed"], "speed"),
-    "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
     "no results to report": (["report", "empty"], "empty: there are no results in this folder or those in it"),
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
-    "negative scenario": (
-        ["scenarios", "generate", "--objects", "2", "--seed", "-1", "--out", "out"],
-        "-1 is negative",
-    ),
-    "nothing to generate": (["scenarios", "generate", "--out", "new"], "give either --objects N or --set NAME"),
-    "both to generate": (
-        ["scenarios", "generate", "--objects", "2", "--set", "c2", "--out", "new"],
-        "give either --objects N or --set NAME, not both",
-    ),
     "unknown set": (["scenarios", "generate", "--set", "c9", "--out", "new"], "c9: there is no such scene set"),
-    "seed of a set": (
-        ["scenarios", "generate", "--set", "d1", "--seed", "3", "--out", "new"],
-        "--count, --target and --seed are not for a set",
-    ),
     "set to search": (
         ["search", "c2-4", "--out", "out"],
         "c2-4: is a set of 180 scenes; name one of them, as c2-4-000",
     ),
-    "no scene of a set": (["inspect", "c2-4-180", "--out", "out"], "c2-4-180: there is no such file"),
     "no scenes to look at": (["lab", "scenes", "none.json"], "none.json: there is no such file"),
-    "the same source twice": (["lab", "scenes", "empty", "out/../empty"], "two sources are called empty"),
-    "no results": (
-        ["lab", "ceiling", "good.json", "--results", "none.json", "--out", "new"],
-        "none.json: cannot be read",
-    ),
-    "no search": (["lab", "ceiling", "good.json", "--rounds", "0", "--out", "new"], "--rounds 0 must be at least 1"),
-    "one scene twice": (
-        ["lab", "ceiling", "good.json", "good.json", "--out", "new"],
-        "two scenes are called one-box",
-    ),
-    "no such suite": (["bench", "guard", "--scenes", "41", "--out", "new"], "--scenes"),
     "no reference": (
         ["bench", "guard", "--reference", "none.json", "--out", "new"],
         "none.json: cannot be read",
     ),
-    "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
-    "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),
-    "negative scenes": (["lab", "recognition", "--scenes", "-1"], "--scenes -1 must be at least 0"),
-    "nothing to recognise": (["lab", "recognition", "--scenes", "0"], "there are no scenes"),
-    "unknown noise": (["lab", "recognition", "--noise", "fog"], "'fog'"),
-    "unknown seed": (["lab", "recognition", "--seed", "-1"], "--seed -1 must be from 0"),
-    "no images": (["bench", "perceive", "--batch", "0"], "--batch 0 must be at least 1"),
-    "nothing to segment": (["lab", "segmentation", "--scenes", "0"], "there are no scenes"),
-    "no picture of segments": (["lab", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
-    "the same scene twice": (["lab", "recognition", "good.json", "good.json"], "two scenes are called one-box"),
-    "file in a file": (["lab", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
-    "no pushes": (["lab", "push", "--pushes", "0"], "lab push: --pushes 0 must be at least 1"),
-    "unknown seed of pushes": (["lab", "push", "--seed", "-1"], "lab push: --seed -1 must be from 0"),
-    "unknown model": (["lab", "push", "--models", "guess"], "guess"),
-    "weights of nothing": (
-        ["lab", "push", "--models", "quasi-static", "--weights", "push.npz"],
-        '--weights is for the model "learned"',
-    ),
-    "no weights": (["lab", "push", "--weights", "none.npz"], "none.json: cannot be read"),
-    "pushes in a file": (["lab", "push", "--models", "no motion", "--data", "good.json"], "cannot be written to"),
     "nothing to predict": (["bench", "predict", "--batch", "0"], "bench predict: --batch 0 must be at least 1"),
-    "too many objects to push": (["bench", "predict", "--objects", "9"], "--objects 9 is not between 1 and 8"),
-    "weights of no network": (
-        ["bench", "predict", "--push-model", "quasi-static", "--weights", "push.npz"],
-        "--weights is for --push-model learned",
-    ),
     "no weights to time": (
         ["bench", "predict", "--push-model", "learned", "--weights", "none.npz"],
         "none.json: cannot be read",
     ),
     "nothing to scale": (["bench", "scaling"], "give --workers, --shards or --ray"),
-    "no workers to scale": (["bench", "scaling", "--workers", "1", "0"], "--workers 0 must be at least 1"),
     "no real scenes": (["bench", "real", "none"], "none: holds no scenes; name a folder"),
-    "no rows to report": (["bench", "report", "--rows", "0"], "--rows 0 must be at least 1"),
-    "nothing to agree on": (["lab", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "nothing to learn from": (["train", "recognition", "--out", "new", "--batch", "0"], "--batch 0 must be at least 1"),
-    "no pushes to learn from": (["train", "push", "--out", "new", "--rounds", "0"], "train push: --rounds 0"),
-    "a file to train into": (["train", "segmentation", "--out", "good.json"], "good.json: cannot be written to"),
-    "pushes kept in a file": (["train", "push", "--out", "new", "--data", "good.json"], "good.json: cannot be written"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }
 
@@ -263,16 +170,6 @@ def test_what_a_checkout_alone_has_is_refused_with_the_way_there():
             cli.parse(["bench", name, "--help"])
 
 
-def test_the_lab_is_a_program_of_a_checkout(folder):
-    answer = subprocess.run(
-        [sys.executable, "-m", "mechsearch_jax.benchmarks.lab", "scenes", "none.json"],
-        cwd=Path(__file__).parents[1], capture_output=True, text=True,
-    )  # fmt: skip
-    assert answer.returncode == 2
-    assert answer.stderr.startswith("mechsearch: none.json: there is no such file")
-    assert answer.stderr.count("\n") == 1
-
-
 def test_the_program_says_it_too_outside_the_checkout(folder):
     arguments, message = WRONG["missing file"]
     answer = mechsearch(folder, *arguments)
@@ -281,14 +178,6 @@ def test_the_program_says_it_too_outside_the_checkout(folder):
     assert message in answer.stderr
     assert answer.stderr.count("\n") == 1
     assert "Traceback" not in answer.stderr
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["search", "--help"], ["scenarios", "--help"], ["bench", "--help"]])
-def test_help_is_no_mistake(capsys, arguments):
-    with pytest.raises(SystemExit) as end:
-        cli.parse(arguments)
-    assert not end.value.code
-    assert "usage: mechsearch" in capsys.readouterr().out
 
 
 def test_a_scenario_is_found_by_file_by_folder_and_by_name(folder, monkeypatch):
@@ -311,19 +200,6 @@ def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "good.json: 1 objects, target cylinder" in printed.out
     assert printed.err.count("\n") == 2
-
-
-def test_a_folder_that_search_wrote_is_good(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    save_scenario(SCENE, "out/scenario.json")
-    save_episode(Episode("one-box", 1, {}, {}, (), None, None, False, "not found"), "out/episode.json")
-    cli.parse(["scenarios", "check", "out"])()
-    printed = capsys.readouterr()
-    assert printed.out == "out/scenario.json: 1 objects, target cylinder\n"
-    assert printed.err == "out/episode.json: is not a scenario file and is left out\n"
-    # Named by itself, it is a mistake.
-    with pytest.raises(SystemExit):
-        cli.parse(["scenarios", "check", "out/episode.json"])()
 
 
 def options_of(*arguments):
@@ -351,18 +227,15 @@ def test_actions_go_by_the_name_of_a_set():
         options_of("--actions", "push", "paper").settings()
 
 
-def test_the_default_preset_is_the_standard():
-    assert options_of().settings().config == PRESETS["standard"]()
-    assert options.DEFAULTS.settings().config == PRESETS["standard"]()
-
-
-@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
-def test_every_option_of_the_configuration_is_one_of_the_command_line(option):
-    usual = PRESETS["standard"]().options()[option.name]
-    usual = tuple(option.outside(usual)) if isinstance(usual, list) else usual
-    given = [str(value) for value in (usual if isinstance(usual, tuple) else [usual])]
-    parsed = options_of(f"--{option.name.replace('_', '-')}", *given)
-    assert getattr(parsed, option.name) == usual
+def test_every_option_of_the_configuration_is_one_of_the_command_line():
+    given, usual = [], PRESETS["standard"]().options()
+    for option in OPTIONS:
+        value = usual[option.name]
+        usual[option.name] = value = tuple(option.outside(value)) if isinstance(value, list) else value
+        values = [str(each) for each in (value if isinstance(value, tuple) else [value])]
+        given += [f"--{option.name.replace('_', '-')}", *values]
+    parsed = options_of(*given)
+    assert {option.name: getattr(parsed, option.name) for option in OPTIONS} == usual
     assert parsed.settings().config == PRESETS["standard"]()
 
 
@@ -386,17 +259,6 @@ def test_help_names_options_with_their_defaults(capsys):
     assert "(default: 100, in preset paper 30)" in shown
     assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
-
-
-@pytest.mark.parametrize("command", ["search", "evaluate", "scenarios generate", "train push", "lab ceiling"])
-def test_help_tells_a_default_once(command, capsys):
-    with pytest.raises(SystemExit):
-        (lab.parse if command.startswith("lab ") else cli.parse)([*command.removeprefix("lab ").split(), "--help"])
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "(default: None)" not in shown
-    assert "(default: )" not in shown
-    for option in re.split(r" (?=--[a-z])", shown):
-        assert not ("(default:" in option and re.search(r"by default|if not given|if left out", option)), option
 
 
 def test_the_version_is_printed(capsys):
@@ -447,15 +309,6 @@ def test_many_episodes_are_run_as_the_options_say(folder, monkeypatch, capsys):
     assert said.out.endswith("new\n")
     cli.parse(arguments)()
     assert (len(seen["jobs"]), seen["limit"], seen["retry_errors"]) == (5, 3600.0, False)
-
-
-def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):
-    monkeypatch.chdir(folder)
-    cli.parse(["report", "table.parquet"])()
-    assert "search-for-grasp" in capsys.readouterr().out
-    cli.parse(["report", "table.parquet", "--out", "report"])()
-    assert {path.name for path in (folder / "report").iterdir()} == set(FILES)
-    assert "report/report.md" in capsys.readouterr().out
 
 
 @pytest.mark.slow

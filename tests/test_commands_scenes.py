@@ -82,22 +82,6 @@ def test_a_folder_of_folders_stands_for_what_is_in_them(folder, capsys):
         options.find_scenarios(["none"])
 
 
-def test_scenes_that_are_not_what_is_on_record_are_reported(folder, capsys, monkeypatch):
-    monkeypatch.setattr(scene_sets, "recorded", lambda: {"d1": ["0123456789ab"] * 3})
-    assert len(options.find_scenarios(["three"])) == 3
-    assert capsys.readouterr().err.splitlines()[-1].startswith("d1-000 and 2 more: made here, not what is on record;")
-
-
-def test_sets_are_listed(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    cli.parse(["scenarios", "list"])()
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    rows = {line[0]: line for line in lines[1:]}
-    assert set(rows) == set(scene_sets.SETS)
-    assert rows["c2-6"] == ["c2-6", "180", "6", "cylinder", scene_sets.digest(scene_sets.SETS["c2-6"])]
-    assert rows["d3"][:5] == ["d3", "80", "4,", "8", "box"]
-
-
 def test_a_set_is_written_into_a_folder_and_nothing_is_overwritten(folder, capsys):
     generate = cli.parse(["scenarios", "generate", "--set", "three", "--out", "new"])
     generate()

@@ -9,20 +9,18 @@ import re
 from pathlib import Path
 
 import pytest
-from stored_rows import row_of
 
-from mechsearch_jax.benchmarks.running import estimate as estimates
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
-from mechsearch_jax.benchmarks.running.episode_seconds import Kind, MeasuredSeconds, StoredSeconds, entries
+from mechsearch_jax.benchmarks.running.episode_seconds import Kind, MeasuredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
 from mechsearch_jax.benchmarks.running.evaluate import SceneOutline, make_jobs, planned_jobs, present_code
-from mechsearch_jax.benchmarks.store.runs import StoredRun, stored_runs
+from mechsearch_jax.benchmarks.store.runs import stored_runs
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.runs import outlines_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.scenes.scene_sets import find_set, recorded
+from mechsearch_jax.envs.scenes.scene_sets import recorded
 from mechsearch_jax.envs.world.mismatch import Mismatch
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.runtime.errors import InputError
@@ -106,18 +104,6 @@ def test_worlds_that_differ_are_swept_and_share_a_compilation(jobs_of):
         jobs_of("evaluate", "one.json", "--world", "camera_shift=1")
 
 
-def test_a_sensor_is_a_key_of_the_world(jobs_of):
-    masks = ("one.json", "--recognition", "masks")
-    (short,) = jobs_of("evaluate", *masks, "--sensor", "active-stereo")
-    (long,) = jobs_of("evaluate", *masks, "--world", "sensor=active-stereo")
-    swept = jobs_of("sweep", *masks, "--world", "sensor=ideal,active-stereo,time-of-flight")
-    assert short.key == long.key == swept[1].key
-    assert swept[0].key == jobs_of("evaluate", *masks)[0].key
-    assert len({job.method.compile_key() for job in swept[1:]}) == 1
-    with pytest.raises(InputError, match="sensor is given twice"):
-        jobs_of("evaluate", *masks, "--sensor", "ideal", "--world", "sensor=ideal")
-
-
 def test_a_file_has_a_table_of_worlds_and_what_is_given_goes_before_it(folder, jobs_of):
     (folder / "sweep.toml").write_text(
         'scenarios = "one.json"\n[world]\nmass = [1, 2]\narm_stop = 2\nholes = "objects"\n'
@@ -187,13 +173,6 @@ def test_a_file_says_it_all_and_what_is_given_goes_before_it(folder, jobs_of):
     }
 
 
-def test_a_file_names_a_configuration(folder, jobs_of):
-    (folder / "mine.toml").write_text('[planner]\npreset = "paper"\ngamma = 0.6\n')
-    (folder / "sweep.toml").write_text('scenarios = "one.json"\nconfig = "mine.toml"\nhorizon = [1, 2]\n')
-    jobs = jobs_of("sweep", "--file", "sweep.toml")
-    assert [job.method.config for job in jobs] == [PRESETS["paper"](gamma=0.6, horizon=horizon) for horizon in (1, 2)]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     {
@@ -215,19 +194,18 @@ def test_what_is_wrong_in_a_file_is_named_with_its_place(folder, jobs_of, text, 
         jobs_of("sweep", "one.json", "--file", "sweep.toml")
 
 
-def test_a_list_in_a_flag_has_commas(jobs_of):
-    with pytest.raises(InputError, match=r"--push-distances 0\.1;0\.2 is no list of numbers"):
-        jobs_of("sweep", "one.json", "--push-distances", "0.1;0.2")
-
-
-@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
-def test_every_option_may_be_swept(option):
-    usual = standard().options()[option.name]
-    usual = option.outside(usual)
-    given = ",".join(map(str, usual)) if isinstance(usual, list | tuple) else str(usual)
-    arguments = ("sweep", "first-light", "--out", "out", f"--{option.name.replace('_', '-')}", given, given)
-    points = cli.parse(arguments).keywords["options"].points()
-    assert [point.settings().config for point in points] == [standard()] * 2
+def test_every_option_may_be_swept():
+    once, twice, usual = [], [], standard().options()
+    for option in OPTIONS:
+        value = option.outside(usual[option.name])
+        given = ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        once += [f"--{option.name.replace('_', '-')}", given]
+        twice += [*once[-2:], given]
+    one, several = (
+        cli.parse(["sweep", "first-light", "--out", "out", *more]).keywords["options"] for more in (once, twice)
+    )
+    assert [point.settings().config for point in one.points()] == [standard()]
+    assert {len(getattr(several, option.name)) for option in OPTIONS} == {2}
 
 
 def test_what_a_run_would_take_is_printed_and_nothing_is_run(folder, capsys):
@@ -285,54 +263,11 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
         estimate(planned, "other", 2)
 
 
-def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
-    batch, native = "MjxSimulator", "NativeSimulator"
-    clock = StoredSeconds(
-        "gpu: H100", Kind("standard", "oracle", True, batch), MeasuredSeconds(0.1, 90.0, 720), "one.json"
-    )
-    slow = dataclasses.replace(clock, kind=Kind("paper", "masks", False, batch), seconds=MeasuredSeconds(2.0, 60.0, 9))
-    published = dataclasses.replace(
-        slow, kind=slow.kind._replace(simulator=native), seconds=MeasuredSeconds(3.0, 60.0, 9)
-    )
-    monkeypatch.setattr(estimates, "stored_seconds", lambda: [clock, slow, published])
-    methods = [
-        Method(engine=batch),
-        Method(config=PRESETS["paper"](), recognition="masks", engine=batch),
-        Method(config=PRESETS["paper"](), recognition="masks", engine=native),
-        Method(recognition="full", engine=batch),
-    ]
-    outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]
-
-    def estimated(device):
-        monkeypatch.setattr(estimates, "versions", lambda: {"device": device})
-        parts = estimate(planned_jobs(outlines, methods, (0, 1)), "none", None).parts
-        return [(part.left, part.seconds.episode_seconds, part.grounds) for part in parts]
-
-    assert estimated("gpu: H100") == [
-        (2, 0.1, "from one.json"),
-        (2, 2.0, "from one.json"),
-        (2, 3.0, "from one.json"),
-        (2, 0.1, "from one.json, of oracle"),
-    ]
-    assert estimated("gpu: A100")[0] == (2, 0.1, "from one.json on H100")
-    assert estimated("cpu: cpu")[0] == (2, 8.0, "assumed: nothing was measured on such a device")
-
-
 def test_the_seconds_of_the_package_are_those_of_the_stored_runs():
     results = Path(__file__).parents[1] / "benchmarks/results"
     written = json.loads(SECONDS_FILE.read_text(encoding="utf-8"))
     assert written == entries(stored_runs(results / "runs")), f"run `python -m {entries.__module__}`"
     assert "MjxSimulator" in {entry["simulator"] for entry in written if entry["device"].startswith("gpu")}
-
-
-def test_of_several_runs_the_fastest_counts():
-    """What ran beside the others made them slower."""
-    rows = [row_of(f"c2-4-{i:03d}", planning_seconds=3.0 + i, simulation_seconds=1.0) for i in range(2)]
-    runs = [StoredRun(f"run{i}", (row,), ({"started": f"2026-01-0{i + 1}"},)) for i, row in enumerate(rows)]
-    for each in (runs, runs[::-1]):
-        (entry,) = entries(each)
-        assert (entry["episode_seconds"], entry["source"]) == (4.0, "benchmarks/results/runs/run0.parquet")
-        assert Kind(*(entry[name] for name in Kind._fields)) == Kind.of(Method())
 
 
 def test_outlines_of_sets_are_those_of_their_files(folder):

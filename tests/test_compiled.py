@@ -1,4 +1,4 @@
-"""Compiled functions are kept on disk: a second process traces nothing, and nothing of something else is run."""
+"""Kept executables: found again, made anew where something differs, and what compiling took."""
 
 import dataclasses
 import os
@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.config.config import PlannerConfig
+from mechsearch_jax.envs.episode import compile_clock
+from mechsearch_jax.envs.episode.compile_clock import EVENTS, CompileClock
 from mechsearch_jax.runtime import compiled, executables
 from mechsearch_jax.runtime.compiled import CachedJit, CachedJitOnHost, keep_in
 from mechsearch_jax.runtime.identity import Unidentified, identity
@@ -70,19 +73,6 @@ def test_a_second_process_traces_nothing(folder):
     jax.tree.map(np.testing.assert_array_equal, as_numbers(second), expected)
 
 
-def test_a_folder_that_is_named_again_has_nothing_loaded_anew(folder, monkeypatch):
-    function = another_process()
-    function(Camera(), VALUES)
-    loaded = []
-    monkeypatch.setattr(executables.Executables, "load", lambda *_: loaded.append("loaded"))
-    keep_in(folder)
-    function(Camera(), VALUES)
-    assert (TRACED, loaded) == (["scaled"], [])
-    keep_in(folder.parent / "another")
-    function(Camera(), VALUES)
-    assert TRACED == ["scaled", "scaled"]
-
-
 def test_the_digest_of_a_package_counts_folders_that_are_links(tmp_path, monkeypatch):
     source, package = tmp_path / "source", tmp_path / "linkedpackage"
     for folder in (source, package):
@@ -137,24 +127,11 @@ def test_other_code_versions_and_processors_are_other_entries(folder, monkeypatc
     assert TRACED == ["scaled"]
 
 
-def test_a_machine_is_identified_by_versions_flags_and_what_its_processor_can(monkeypatch):
-    before = executables._machine.__wrapped__()
-    assert jax.__version__ in before
-    assert executables.processor() in before
-    assert not os.path.exists("/proc/cpuinfo") or "flags=" in before or "Features=" in before
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-    assert executables._machine.__wrapped__() != before
-
-
 def test_settings_of_jax_are_other_entries(folder):
     another_process()(Camera(), VALUES)
     with jax.default_matmul_precision("highest"):
         assert not another_process().is_ready(Camera(), VALUES)
     assert another_process().is_ready(Camera(), VALUES)
-
-
-def test_the_code_that_counts_is_all_that_may_be_traced():
-    assert executables._source() == executables.source_digest((".py",), ("mechsearch_jax", "mechsearch_jax.envs"))
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "altered", "of another", "no executable"])
@@ -208,26 +185,6 @@ def test_what_is_prepared_in_memory_is_what_is_called():
     assert function.jitted._cache_size() == called
     expected = jax.jit(scaled, static_argnames="camera")(Camera(), values)
     jax.tree.map(np.testing.assert_array_equal, as_numbers(result), as_numbers(expected))
-
-
-def test_what_is_wrong_with_what_is_prepared_is_said_there_and_by_a_call():
-    def wrong(values):
-        raise ValueError("wrong")
-
-    function = CachedJit(wrong, on_disk=False)
-    for _ in range(2):
-        with pytest.raises(ValueError, match="wrong"):
-            function.begin(VALUES)
-    with pytest.raises(ValueError, match="wrong"):
-        function(VALUES)
-
-
-def test_what_depends_on_more_than_its_arguments_stays_out_of_the_folder(folder):
-    for factor in (2.0, 3.0):
-        function = CachedJit(lambda values, factor=factor: values * factor, on_disk=False)
-        function.prepare(VALUES)
-        assert float(function(VALUES)[0]) == factor
-    assert not folder.exists()
 
 
 def test_inside_of_transformations_it_is_a_jitted_function(folder):
@@ -286,25 +243,10 @@ def test_a_folder_that_others_may_write_to_is_not_read(folder):
     assert TRACED == ["scaled"]
 
 
-def test_a_folder_that_cannot_be_made_is_done_without(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    keep_in(tmp_path / "file" / "executables")
-    try:
-        assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
-    finally:
-        keep_in(None)
-
-
 def test_the_oldest_entries_give_way(folder, monkeypatch):
     monkeypatch.setattr(executables, "MOST_BYTES", 0)
     another_process()(Camera(), VALUES)
     assert not list(folder.iterdir())
-
-
-def test_an_option_that_xla_does_not_know_is_done_without(folder, monkeypatch):
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    monkeypatch.setattr(compiled, "CPU_OPTIONS", {"xla_of_another_version": True})
-    assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
 
 
 class Colour(compiled.CachedJit):
@@ -406,3 +348,53 @@ def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
 def test_recognition_which_uses_lapack_runs_from_disk(tmp_path):
     assert run(PERCEIVE, tmp_path) == run(PERCEIVE, tmp_path)
     assert {file.name.partition("-")[0] for file in (tmp_path / "executables").iterdir()} >= {"explained_image"}
+
+
+def tell(seconds, event=f"{EVENTS}backend_compile_duration"):
+    jax.monitoring.record_event_duration_secs(event, seconds)
+
+
+def test_what_jax_compiles_is_counted_while_the_clock_runs():
+    @jax.jit
+    def never_seen(x):
+        return jnp.sin(x) * 3.5 + jnp.cos(x)
+
+    with CompileClock() as clock:
+        start = time.perf_counter()
+        never_seen(jnp.arange(7.0)).block_until_ready()
+        took = time.perf_counter() - start
+        assert 0.0 < clock.seconds <= took
+        before = clock.seconds
+        never_seen(jnp.arange(7.0)).block_until_ready()
+        assert clock.seconds == before
+    tell(1.0)
+    assert clock.seconds == before
+
+
+def test_what_is_compiled_inside_of_something_else_counts_once(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    with CompileClock() as clock:
+        for at, seconds in ((100.0, 2.0), (101.0, 0.5), (104.0, 6.0)):
+            now[0] = at
+            tell(seconds)
+        assert clock.seconds == pytest.approx(6.0)
+        now[0] = 110.0
+        tell(1.0)
+        tell(50.0, "/jax/something/else")
+        assert clock.seconds == pytest.approx(7.0)
+
+
+def test_a_stage_is_timed_without_what_was_compiled_in_it(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    with CompileClock() as compiling:
+        clock = compile_clock.StageClock(2, lambda stage, slots: None, compiling)
+        for stage, rows, compiled, other in (("plan", [0, 1], 8.0, 2.0), ("judge", [1], 0.0, 3.0)):
+            with clock(stage, rows):
+                now[0] += compiled
+                if compiled:
+                    tell(compiled)
+                now[0] += other
+    assert clock.timings(0) == {"plan": 1.0, "compile": 4.0}
+    assert clock.timings(1) == {"plan": 1.0, "compile": 4.0, "judge": 3.0}

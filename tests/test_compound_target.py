@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from test_shapes_union import cut_of
 from test_workspace_target import BOTTLE, CUP, TEE
 
@@ -30,7 +29,6 @@ from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import Piece, solids
 from mechsearch_jax.shapes.solid import surface
 from mechsearch_jax.shapes.union import field_of
-from mechsearch_jax.viz.drawing import draw_target, target_points
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf
@@ -141,16 +139,6 @@ def test_a_target_that_the_gripper_cannot_take_is_refused_in_one_line():
     ball = Target.from_parts((Piece("ellipsoid", (0.06, 0.06, 0.06)),))
     with pytest.raises(InputError, match="Target: the gripper fits nowhere"):
         grasp_tables(Gripper(), ball, GraspConfig())
-
-
-@every_target
-def test_pictures_show_its_outline(target):
-    axes = Figure().subplots()
-    draw_target(axes, np.array([0.6, 0.1, 0.4]), target, certain=True)
-    assert len(axes.patches) == 1
-    points = target_points(np.array([0.6, 0.1, 0.4]), target, SHELF)
-    assert np.ptp(points[:, 2]) == pytest.approx(target.tall)
-    assert points[:, 2].min() == pytest.approx(SHELF.board)
 
 
 @every_target

@@ -7,16 +7,11 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-import scripted
 
-from mechsearch_jax.benchmarks.running.evaluate import make_jobs
-from mechsearch_jax.benchmarks.running.processes import Processes
-from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.world import model
 from mechsearch_jax.runtime import cores as cores_module
 from mechsearch_jax.runtime.cores import VARIABLE, cores, cpu_quota, on_host, share_of_cores
 from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.scenario import example_scenarios
 from mechsearch_jax.workspace.shelf import Shelf
 
 
@@ -100,17 +95,6 @@ def test_beside_a_gpu_the_host_computes_and_alone_it_is_what_computes_anyway(mon
 def test_processes_share_them(monkeypatch, processes, each):
     monkeypatch.setenv(VARIABLE, "6")
     assert share_of_cores(processes) == {VARIABLE: each}
-
-
-@pytest.mark.slow
-@pytest.mark.always
-def test_workers_are_given_their_share(monkeypatch):
-    monkeypatch.setenv(VARIABLE, "6")
-    jobs = make_jobs([example_scenarios()["first-light"]], [Method()], (0, 1))
-    rows, before = [], dict(os.environ)
-    Processes(4, run=scripted.share)(jobs, rows.extend, lambda job: True)
-    assert [row.failure for row in rows] == ["error: share 3"] * 2
-    assert dict(os.environ) == before
 
 
 def test_a_simulation_that_diverges_leaves_no_log(tmp_path, monkeypatch):

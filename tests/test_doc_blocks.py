@@ -100,24 +100,6 @@ def test_what_would_be_run_is_said(arguments, tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.rglob("*.parquet"))
 
 
-def test_what_is_no_command_is_noticed(tmp_path):
-    page = tmp_path / "page.md"
-    loop = "for k in 0 1; do A=$k B=$(($(nproc) / 8)) mechsearch evaluate c2 --out rows/$k & done  # all"
-    page.write_text(f"```sh\n{loop}\n```\n")
-    assert list(commands(page)) == [["mechsearch", "evaluate", "c2", "--out", "rows/0"]]
-
-
-@pytest.mark.parametrize(
-    ("line", "why"),
-    [("mechsearch search 'first-light", "No closing quotation"), ("mechsearch search $scene", r"\$scene")],
-)
-def test_what_cannot_be_read_is_named_with_its_page(tmp_path, line, why):
-    page = tmp_path / "page.md"
-    page.write_text(f"```sh\nmechsearch doctor\n{line}\n```\n")
-    with pytest.raises(AssertionError, match=rf"page\.md: .*{why}"):
-        test_commands_are_understood(page)
-
-
 def test_objects_of_scenario_files_are_read(tmp_path):
     trimesh.creation.box((80.0, 80.0, 100.0)).export(tmp_path / "mug.obj")
     target = {

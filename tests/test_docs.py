@@ -1,6 +1,5 @@
 """The guides: their links lead somewhere, their code runs, and what the source cites of them is there."""
 
-import ast
 import importlib.util
 import json
 import math
@@ -133,21 +132,6 @@ def test_the_api_pages_hold_all_of_the_front_door():
     assert set(mechsearch_jax._ROOMS.items()) <= {(name, room) for room, name in shown}
 
 
-def test_what_the_robots_page_explains_is_said():
-    said = [
-        part.value
-        for file in (ROOT / "mechsearch_jax").rglob("*.py")
-        for part in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(part, ast.Constant) and isinstance(part.value, str)
-    ]
-    headers = ("| it begins with | what it means | what to do |", "| it says | what to do |")
-    cells = [row[0] for header in headers for row in rows("docs/robot.md", header)]
-    texts = [text for cell in cells for text in re.findall("`(.*?)`", cell)]
-    assert len(texts) > 30
-    for piece in {piece for text in texts for piece in text.split("…") if len(piece) > 3}:
-        assert any(piece.strip() in one for one in said), piece
-
-
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
     table = rows("docs/commands.md", "| option | what it sets | `standard` | `paper` |")
     stated = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
@@ -271,8 +255,3 @@ def test_the_options_that_the_glossary_names_are_there():
     commands = read("docs/commands.md")
     for word, (*_, option) in glossary().items():
         assert option == "–" or option.strip("`") in commands, f"{word}: {option}"
-
-
-def test_the_glossary_says_a_word_once():
-    words = [word for row in glossary() for word in row.split(", ")]
-    assert len(words) == len(set(words)) > 50

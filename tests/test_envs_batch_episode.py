@@ -9,7 +9,7 @@ import pytest
 from stage import HIDDEN, OPEN, TWO, Grab, Shuffled, Stage, grab, grab_nearest, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
-from mechsearch_jax.envs.camera.snapshot import informed, oracle
+from mechsearch_jax.envs.camera.snapshot import oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
@@ -77,19 +77,6 @@ def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem,
     assert [without_times(e) for e in episodes] == [without_times(e) for e in alone]
     assert {e.scenario for e in episodes if e.retrieved} >= {"open"}
     assert all(step.timings["recognise"] > 0 for e in episodes for step in e.steps)
-
-
-@pytest.mark.slow
-def test_an_informed_planner_knows_a_hidden_target_in_a_batch_as_alone(problem):
-    scenarios, episodes = [HIDDEN, TWO, OPEN], {}
-    settings = RunSettings(informed, max_steps=2, at_once=AT_ONCE)
-    run_episodes(
-        [Start(s, 0) for s in scenarios], problem, grab, Stage(reveal), 2, Listeners(episodes.update), settings
-    )
-    for i, scenario in enumerate(scenarios):
-        alone = run_episode(Start(scenario, 0), problem, grab, Stage(reveal), settings)
-        assert without_times(episodes[i]) == without_times(alone)
-        assert (alone.found_step, alone.retrieved) == (0, True)
 
 
 @pytest.mark.slow
@@ -235,14 +222,6 @@ def test_nothing_is_compiled_in_the_rounds(problem):
     assert compiled == []
 
 
-def test_one_slot_runs_episodes_one_after_the_other(problem):
-    stage = Stage({"hidden": reveal})
-    episodes, together = run(problem, [OPEN, HIDDEN, OPEN], stage, 1)
-    assert [e.retrieved for e in episodes] == [True, True, True]
-    assert together == [1, 1, 1]
-    assert stage.executed == [["open"], ["hidden"], ["hidden"], ["open"]]
-
-
 def test_what_fails_belongs_to_its_own_row(problem):
     stage = Stage({"hidden": reveal, "tipped": topple}, overflows={"two": Overflow.ROWS | Overflow.CONTACTS})
     tipped = dataclasses.replace(HIDDEN, name="tipped")
@@ -296,13 +275,6 @@ def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():
     assert [(step.fallen, step.target_fallen) for step in episode.steps] == [((1,), True), ((2,), False)]
 
 
-def test_an_error_is_named_before_what_fell():
-    log = EpisodeLog(2)
-    log.decide(record(False, 9, Verdict(), None))
-    assert log.act(dataclasses.replace(WON, off_board=frozenset({0})), "error: no", {})
-    assert log.episode(OPEN, {}).failure == "error: no"
-
-
 def test_decisions_that_cannot_be_trusted_are_named():
     good = Choice(no_action(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
     assert distrust(good) is None
@@ -311,31 +283,12 @@ def test_decisions_that_cannot_be_trusted_are_named():
     assert distrust(good.replace(cost=jnp.float32(jnp.inf))) == "error: the decision is not finite"
 
 
-def test_a_policy_need_not_say_what_it_expects():
-    silent = Choice(no_action(), jnp.float32(3.0), jnp.float32(jnp.nan), jnp.int32(1))
-    assert distrust(silent) is None
-    step = record(False, 5, Verdict(), silent)
-    assert (step.cost, step.predicted_cost, step.sequences) == (3.0, None, 1)
-
-
 def test_a_decision_that_cannot_be_trusted_is_not_executed(problem):
     """One that is not finite ends its own episode, and the others go on."""
     stage = Stage()
     episodes, _ = run(problem, [OPEN, HIDDEN], stage, 2, Grab(charge=float("nan")))
     assert [e.failure for e in episodes] == [None, "error: the decision is not finite"]
     assert stage.executed == [["open", None]]
-
-
-def test_only_a_single_slot_can_be_watched(problem):
-    class Watching:
-        def busy(self, stage): ...
-
-        def decided(self, moment): ...
-
-        def acted(self, moment): ...
-
-    with pytest.raises(InputError, match="one slot, not at 2"):
-        run(problem, [OPEN, HIDDEN], Stage(), 2, watcher=Watching())
 
 
 def test_worlds_of_the_native_simulator_are_checked():

@@ -7,14 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 from test_envs_simulator import pose, take_out
 
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe, target_pixels
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, sight_of
 from mechsearch_jax.envs.episode.episodes import target_of
-from mechsearch_jax.envs.recording.body_solids import body_points, body_solids
-from mechsearch_jax.envs.simulators.batch_model import ROOM, cells_of, compound_fields, fitting, like_present, room_for
+from mechsearch_jax.envs.simulators.batch_model import ROOM, cells_of, compound_fields, fitting, room_for
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials import native as trials
@@ -174,6 +172,7 @@ def test_a_found_target_stands_in_trials_as_what_it_is():
             np.testing.assert_allclose(rests, (0.6, 0.1, SHELF.board + MUG.bottom), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_batch_model_holds_the_target_itself():
     scenes = [hidden(TENT, BOX, yaw=0.5), hidden(TENT, standing(MUG, 0.5, -0.1), x=0.7)]
     factors = np.linspace(0.5, 1.5, BODIES)
@@ -198,52 +197,11 @@ def test_the_batch_model_holds_the_target_itself():
             np.testing.assert_allclose(found, getattr(wanted, f"geom_{name}")[geoms[1]], 1e-5, 1e-6, err_msg=name)
 
 
-def test_worlds_of_another_target_do_not_stand_side_by_side():
-    present = jax.tree.map(lambda leaf: np.asarray(leaf)[None], from_scenario(hidden(MUG, BOX)))
-    with pytest.raises(InputError, match="another target; run them one set after the other"):
-        like_present(present, hidden(TALL, BOX))
-    with pytest.raises(InputError, match="differ in their target"):
-        fitting(present, room_for(from_scenario(hidden(TALL))))
-
-
-def test_pictures_show_its_solids():
-    world = jax.tree.map(np.asarray, from_scenario(hidden(TENT, BOX)))
-    shown = body_solids(world)
-    assert sorted(shown) == sorted(body_points(world)) == [0, TARGET]
-    (tent,) = shown[TARGET]
-    assert tent.colour == tuple(map(float, PALETTE[TARGET]))
-    rays = [np.linspace(-0.02, 0.02, 5), np.zeros(5), -np.ones(5)]
-    depth = tent.surface.cut([0.0, 0.0, 1.0], rays, tent.half_size, np)
-    hull = trimesh.convex.convex_hull(np.array(TENT.compound.pieces[0].vertices))
-    points = np.stack([rays[0] * depth, rays[1] * depth, 1.0 - depth], axis=1)
-    outside = points @ hull.face_normals.T - np.einsum("fi,fi->f", hull.face_normals, hull.triangles_center)
-    np.testing.assert_allclose(outside.max(axis=1), 0.0, atol=1e-6)
-    normal = tent.surface.normal(points, np.broadcast_to(tent.half_size, (5, 3)), np)
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-6)
-
-
 BODY = {
     "density": 500,
     "friction": 0.4,
     "pieces": [{"shape": "box", "half_size": [0.03, 0.02, 0.05], "position": [0, 0, 0], "quaternion": list(UPRIGHT)}],
 }
-ON_ITS_SIDE = [0.5**0.5, 0.5**0.5, 0.0, 0.0]
-
-
-def test_a_target_is_read_from_a_mesh_or_a_body(tmp_path):
-    box = trimesh.creation.box((60, 40, 100))
-    box.export(tmp_path / "box.stl")
-    mesh = load_target(tmp_path / "box.stl", 0.001)
-    np.testing.assert_allclose(mesh.half_size, (0.03, 0.02, 0.05), atol=1e-6)
-    (tmp_path / "body.json").write_text(json.dumps(BODY))
-    body = load_target(tmp_path / "body.json")
-    np.testing.assert_allclose(body.half_size, (0.03, 0.02, 0.05), atol=1e-6)
-    for made in (BODY, {"mesh": "box.stl", "scale": 0.001, "density": 500, "friction": 0.4}):
-        (tmp_path / "turned.json").write_text(json.dumps({**made, "quaternion": ON_ITS_SIDE}))
-        turned = load_target(tmp_path / "turned.json")
-        np.testing.assert_allclose(turned.half_size, (0.03, 0.05, 0.02), atol=1e-6)
-        assert turned.bottom == pytest.approx(0.02, abs=1e-6)
-        assert turned.compound.density == 500.0
 
 
 @pytest.mark.parametrize(

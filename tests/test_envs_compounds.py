@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.simulators.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import model, world
-from mechsearch_jax.envs.world.world import compounds_of
 from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, centred, half_extents, inertial
 from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.scenario import Body, Scenario, pieces_of
@@ -58,12 +57,6 @@ def compiled(scene, skin=0.0):
     bodies = world.slots(scene)
     blank = model.compile_model(Shelf(), CAMERA, compounds=model.compounds_in(bodies), skin=skin)
     return model.with_bodies(blank, bodies, skin=skin), bodies
-
-
-def test_a_scene_without_compounds_has_a_plain_world():
-    plain = world.from_scenario(Scenario("plain", (BOX,), TARGET_BODY))
-    assert plain.compounds is None
-    assert world.from_scenario(SCENE).compounds is not None
 
 
 def test_bodies_come_back_from_a_world():
@@ -171,15 +164,6 @@ def test_polyhedra_look_alone_as_they_do_side_by_side():
         np.testing.assert_allclose(both.colour[i], alone.colour, atol=1e-4)
 
 
-def test_compounds_have_their_own_colours():
-    scene = Scenario("one", (body(*MUG, place=(0.55, 0.1, 0.4545), colour=(0.0, 1.0, 0.0)),), TARGET_BODY)
-    seen = simulated_camera.observe(CAMERA, world.from_scenario(scene))
-    shown = np.asarray(seen.colour)[np.asarray(seen.segmentation) == 0]
-    assert len(shown) > 20
-    assert (shown[:, 1] >= simulated_camera.AMBIENT - 1e-6).all()
-    assert (shown[:, [0, 2]] == 0).all()
-
-
 def test_a_compound_rests_on_its_pieces():
     table = (Piece("box", (0.04, 0.04, 0.005), (0, 0, 0.05)), Piece("cylinder", (0.03, 0.03, 0.025), (0, 0, 0.02)))
     one = body(*table, place=(0.6, 0.1, 0.55))
@@ -223,12 +207,3 @@ def test_scenes_with_and_without_compounds_run_side_by_side():
     # What was stacked can be set again.
     simulator.load(jax.tree.map(lambda leaf: leaf[:2], simulator.world))
     np.testing.assert_allclose(simulator.world.position[0], alone.world.position[0])
-
-
-def test_plain_bodies_among_compounds_are_a_single_solid():
-    made = compounds_of(world.slots(SCENE))
-    assert made.compound.tolist() == [True, True, True, False, False, False, False, False, False]
-    # The frustum is a stack of discs.
-    assert made.solids.valid.sum(axis=1).tolist() == [2, 7, 2, 1, 0, 0, 0, 0, 1]
-    assert made.parts.valid.sum(axis=1).tolist() == [2, 4, 2, 1, 0, 0, 0, 0, 1]
-    assert float(made.matter.mass[3]) == pytest.approx(737 * 8 * 0.054 * 0.025 * 0.054, rel=1e-5)

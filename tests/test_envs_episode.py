@@ -14,8 +14,6 @@ from stage import (
     HIDDEN,
     OPEN,
     TWO,
-    UPRIGHT,
-    Grab,
     Shuffled,
     Stage,
     grab,
@@ -40,7 +38,7 @@ from mechsearch_jax.envs.camera.snapshot import (
 )
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.endings import events, verdict
-from mechsearch_jax.envs.episode.episodes import run_episode, target_of
+from mechsearch_jax.envs.episode.episodes import run_episode
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.numbering import named_observation
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
@@ -54,9 +52,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.scenario import Body, Scenario
-from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.workspace.scenario import Scenario
 
 METHOD = Method().options()
 # Heavy boxes on both sides of the target and one before it: it is hidden, and every grasp hits something.
@@ -226,33 +222,6 @@ def test_objects_in_any_order_give_the_same_decisions_and_names_follow_the_bodie
                 assert frame(plain, problem).title == frame(shuffled, problem).title
 
 
-def test_an_object_that_is_not_there_is_none_in_the_record(problem):
-    @dataclasses.dataclass(frozen=True)
-    class Phantom:
-        detects_target: bool = True
-
-        def __call__(self, key, snapshot):
-            seen = oracle(key, snapshot)
-            place = jnp.array([0.5, -0.3, 0.48])
-            return seen.replace(objects=seen.objects.replace(position=seen.objects.position.at[0].set(place)))
-
-    stage = Stage()
-    episode = run(problem, BLOCKED, stage, recogniser=Phantom())
-    assert episode.steps[0].action.kind == "push"
-    assert episode.steps[0].action.object is None
-    # For the simulator it is an empty slot.
-    assert int(stage.actions[0].object) >= len(BLOCKED.objects)
-
-
-def test_narration_says_that_something_else_is_taken_for_the_target(problem):
-    text = io.StringIO()
-    console = Console(file=text, width=200)
-    with console.status("") as status:
-        run(problem, HIDDEN, Stage(reveal), watcher=Narrator(console, status, problem), recogniser=Hasty())
-    assert "that it takes for the target" in text.getvalue()
-    assert "the target at x 0.620" in text.getvalue()
-
-
 @pytest.mark.parametrize("policy", ["grab", "search-for-grasp"])
 def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     diary = Diary()
@@ -274,34 +243,6 @@ def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     assert diary.stages == ["recognise", "plan", "simulate", "recognise", "plan", "judge", "simulate"]
     save_episode(episode, tmp_path / "episode.json")
     assert load_episode(tmp_path / "episode.json").steps == episode.steps
-
-
-def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
-    console = Console(record=True, width=200, file=io.StringIO())
-    narrator = Narrator(console, console.status("begins"), problem)
-    episode = run(problem, HIDDEN, Stage(reveal, retrievals=Failure.MISSED), watcher=narrator)
-    narrator.ended(episode)
-    first, *others = console.export_text().split("step 2")
-    narrated = others[0]
-    assert f"no target; it can be at {episode.steps[0].belief_size} of 792 poses" in first
-    assert f"cost {episode.steps[0].cost:.0f} now" in first
-    assert "the target at x" in narrated
-    assert "a grasp that takes it out is known" in narrated
-    assert "failed  the hand missed the target" in narrated
-    assert narrated.strip().endswith(verdict(episode))
-    assert len(narrator.frames) == len(episode.steps)
-    assert [frame.found for frame in narrator.frames] == [False, True, True]
-    assert "the hand missed the target" in narrator.frames[1].caption
-
-
-def test_a_policy_that_compares_no_costs_is_not_said_to(problem):
-    console = Console(record=True, width=200, file=io.StringIO())
-    narrator = Narrator(console, console.status("begins"), problem)
-    run(problem, HIDDEN, Stage(reveal), Grab(minds=0.0), watcher=narrator)
-    first = console.export_text().split("step 2")[0]
-    assert "the policy compares no costs" in first
-    assert "expected" not in first
-    assert "costs not compared" in narrator.frames[0].caption
 
 
 def test_failed_actions_cost_steps_and_nothing_is_rolled_back(problem):
@@ -445,16 +386,6 @@ def test_an_f_that_becomes_empty_is_counted(problem):
     assert [step.restarts for step in episode.steps] == [1, 2, 3]
 
 
-@pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=lambda target: target.shape)
-def test_the_candidate_nearest_to_a_pose(target):
-    poses = target.candidate_poses(Shelf())
-    step = target.cell(Shelf())
-    for i in np.random.default_rng(0).integers(len(poses), size=50):
-        for turns in (0, 1, -1) if target.yaws > 1 else (0, 0.3):
-            off = 0.4 * np.array(step) * [1, -1, 1] + [0, 0, np.pi * turns]
-            assert int(nearest_candidate(jnp.asarray(poses), jnp.asarray(poses[i] + off, jnp.float32))) == i
-
-
 def test_after_the_last_action_only_a_retrieval_is_executed(problem):
     def never(key, problem, belief, observation):
         """Goes on pushing."""
@@ -531,9 +462,19 @@ def test_the_oracle_leaves_out_what_fell_off_the_board(problem):
     np.testing.assert_allclose(seen.target_pose, [0.62, 0.07, 0.0], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("shape", "half", "yaws"), [("cylinder", (0.02, 0.02, 0.05), 1), ("box", (0.015, 0.02, 0.05), 6)]
-)
-def test_a_scenario_says_what_its_target_is(shape, half, yaws):
-    target = target_of(Scenario("one", (), Body(shape, half, CYLINDER.position, UPRIGHT)))
-    assert (target.shape, target.half_size, target.yaws) == (shape, half, yaws)
+def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
+    console = Console(record=True, width=200, file=io.StringIO())
+    narrator = Narrator(console, console.status("begins"), problem)
+    episode = run(problem, HIDDEN, Stage(reveal, retrievals=Failure.MISSED), watcher=narrator)
+    narrator.ended(episode)
+    first, *others = console.export_text().split("step 2")
+    narrated = others[0]
+    assert f"no target; it can be at {episode.steps[0].belief_size} of 792 poses" in first
+    assert f"cost {episode.steps[0].cost:.0f} now" in first
+    assert "the target at x" in narrated
+    assert "a grasp that takes it out is known" in narrated
+    assert "failed  the hand missed the target" in narrated
+    assert narrated.strip().endswith(verdict(episode))
+    assert len(narrator.frames) == len(episode.steps)
+    assert [frame.found for frame in narrator.frames] == [False, True, True]
+    assert "the hand missed the target" in narrator.frames[1].caption

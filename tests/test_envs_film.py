@@ -15,7 +15,7 @@ from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.recording import film as film_module
 from mechsearch_jax.envs.recording.film import Film
 from mechsearch_jax.envs.recording.pictures import recorded_frame
-from mechsearch_jax.envs.recording.playback import ENDS, LOOKS, WAY_TIME, Playback, playback
+from mechsearch_jax.envs.recording.playback import ENDS, LOOKS, Playback, playback
 from mechsearch_jax.envs.recording.recording import (
     NAME,
     Recorder,
@@ -23,7 +23,7 @@ from mechsearch_jax.envs.recording.recording import (
     save_recording,
 )
 from mechsearch_jax.envs.simulators.trace import Trace
-from mechsearch_jax.envs.world.world import BODIES, TARGET
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.geometry.bodies import with_parts
 from mechsearch_jax.robot.arm_config import PANDA
 from mechsearch_jax.robot.kinematics import HOME
@@ -73,35 +73,15 @@ def forget(arrays):
     del arrays["world.kind"]
 
 
-def rename(arrays):
-    arrays["head"] = np.array(str(arrays["head"]).replace("mechsearch recording", "something"))
-
-
-def widen(arrays):
-    arrays["world.position"] = np.zeros((3, BODIES, 2), np.float32)
-
-
-def misname(arrays):
-    arrays["world.kind"] = arrays["world.kind"] + 7
-
-
 def lose(arrays):
     arrays["trace.q"] = arrays["trace.q"] * np.nan
-
-
-def retype(arrays):
-    arrays["existence"] = arrays["existence"].astype("U1")
-
-
-def forget_samples(arrays):
-    arrays["sampled.value"] = arrays["sampled.value"][1:]
 
 
 def misname_samples(arrays):
     arrays["sampled.action.kind"] = arrays["sampled.action.kind"] + 90
 
 
-@pytest.mark.parametrize("spoil", [forget_samples, misname_samples, cut, forget, rename, widen, misname, lose, retype])
+@pytest.mark.parametrize("spoil", [misname_samples, cut, forget, lose])
 def test_what_is_no_recording_is_refused_in_one_line(spoil, tmp_path):
     save_recording(RECORDING, tmp_path / NAME)
     with np.load(tmp_path / NAME) as file:
@@ -175,23 +155,6 @@ def test_a_step_in_which_nothing_moves_is_shown_all_the_same(played):
     assert resting == pytest.approx(ENDS, abs=0.1)
 
 
-def test_a_faster_film_has_fewer_pictures_of_the_same_time(played):
-    fast = playback(RECORDING, 25, speed=2.0)
-    assert len(fast.time) == pytest.approx(len(played.time) / 2, abs=1)
-    assert fast.time[-1] == pytest.approx(played.time[-1], abs=0.1)
-
-
-def test_where_no_way_is_found_a_straight_one_is_shown(monkeypatch):
-    def lost(*arguments, **options):
-        raise InputError("no way")
-
-    monkeypatch.setattr("mechsearch_jax.envs.recording.playback.free_motion", lost)
-    shown = playback(dataclasses.replace(RECORDING, steps=RECORDING.steps[:1]), 25)
-    # What settles while the hand is at home is left out at the end.
-    lasts = LOOKS + 2 * WAY_TIME + MOVES + ENDS
-    assert shown.time[-1] == pytest.approx(lasts, abs=0.2)
-
-
 def test_a_film_shows_the_robot_the_map_and_what_the_camera_saw(tmp_path):
     film = Film(RECORDING, 320, 1)
     images = list(film)
@@ -245,20 +208,6 @@ def test_a_movie_is_what_its_ending_says(tmp_path):
         picture.seek(3)
         assert np.asarray(picture.convert("RGB")).mean() == pytest.approx(80, abs=4)
         assert picture.info["duration"] == 200
-
-
-def test_a_movie_that_cannot_be_made_leaves_what_was_there(tmp_path):
-    path = tmp_path / "film.mp4"
-    path.write_text("from before")
-
-    def images():
-        yield FADING[0]
-        raise InputError("no more")
-
-    with pytest.raises(InputError, match="no more"):
-        save_movie(images(), path, 5)
-    assert path.read_text() == "from before"
-    assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
 
 
 WRONG = {

@@ -1,20 +1,15 @@
 """`mechsearch doctor`: what it finds, what it advises, and when it says that nothing works."""
 
 import dataclasses
-import importlib.metadata
 import re
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.health import cell_health as health
 from mechsearch_jax.envs.health.cell_health import State
-from mechsearch_jax.networks import weights
-from mechsearch_jax.problem import cache
 from mechsearch_jax.problem.problem import NOWHERE
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
@@ -22,7 +17,6 @@ from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
-from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 SCENE = load_scenario(example_scenarios()["first-light"])
@@ -30,51 +24,6 @@ SCENE = load_scenario(example_scenarios()["first-light"])
 
 def findings_of(subject, settings=None):
     return list(health.examine(subject, health.checks(SCENE, settings or Settings())[subject]))
-
-
-def test_versions_devices_and_simulator_are_named():
-    (versions,) = findings_of("versions")
-    assert versions.state is State.FINE
-    assert f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')}" in versions.says
-    assert "JAX computes on cpu" in findings_of("devices")[0].says
-    assert findings_of("simulator")[0].state is State.FINE
-
-
-def test_a_package_that_is_missing_breaks_the_main_job(monkeypatch):
-    monkeypatch.setattr(health, "PACKAGES", ("jax", "no-such-package"))
-    broken = findings_of("versions")[-1]
-    assert (broken.state, broken.remedy) == (State.BROKEN, "pip install no-such-package")
-
-
-def test_a_gpu_that_jax_does_not_see_is_reported(monkeypatch):
-    monkeypatch.setattr(health.shutil, "which", lambda name: f"/usr/bin/{name}")
-    assert "mechsearch-jax[gpu]" in findings_of("devices")[-1].remedy
-
-
-def test_the_weights_are_listed_with_their_digests(monkeypatch):
-    digests = [finding.says.split()[-1] for finding in findings_of("weights")]
-    assert digests == [weights.shipped_weights(name).card["sha256"][:12] for name in weights.ARCHITECTURES]
-
-    def damaged(path, name):
-        raise InputError(f"{path}: is not the file that its card describes")
-
-    monkeypatch.setattr(weights, "load_weights", damaged)
-    assert {finding.state for finding in findings_of("weights")} == {State.BROKEN}
-
-
-def test_the_caches_are_measured(tmp_path, monkeypatch):
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path))
-    (tmp_path / "file").write_bytes(bytes(2_000_000))
-    (whole,) = findings_of("cache")
-    assert whole.says.endswith(f"{tmp_path}, 1 files, 2 MB, writable")
-    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "file"))
-    (broken,) = findings_of("cache")
-    assert (broken.state, kept_arrays.VARIABLE in broken.remedy) == (State.MISSING, True)
-    monkeypatch.setenv(kept_arrays.VARIABLE, "")
-    assert "every start takes minutes" in findings_of("cache")[0].says
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    assert [finding.says.split(":")[0] for finding in findings_of("cache")] == ["problems are not kept", "compilations"]
 
 
 @pytest.mark.parametrize("prefix", ["site/cmeel.prefix", "env"])
@@ -87,15 +36,6 @@ def test_the_robots_meshes_are_found_without_a_module(tmp_path, monkeypatch, pre
     folder.mkdir(parents=True)
     (found,) = findings_of("meshes")
     assert (found.state, str(folder) in found.says) == (State.FINE, True)
-
-
-def test_a_problem_is_looked_for_in_the_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path))
-    assert findings_of("problem")[0].state is State.MISSING
-    key = cache._key(cache._parts(target_of(SCENE), None, None, None, None))
-    cache._file(tmp_path, key).touch()
-    assert findings_of("problem")[0].state is State.FINE
-    assert findings_of("problem", Settings(Workcell(shelf=Shelf(back=0.8))))[0].state is State.MISSING
 
 
 def cell_of(problem, monkeypatch, settings=None):
@@ -168,11 +108,6 @@ def test_doctor_looks_at_the_cell_that_is_given(problem, monkeypatch, tmp_path, 
     assert "camera     BROKEN   camera: looks away from the shelf" in capsys.readouterr().out
 
 
-def test_what_cannot_be_rendered_is_no_harm(monkeypatch):
-    monkeypatch.setattr(health.subprocess, "run", lambda *a, **k: subprocess.CompletedProcess((), 1))
-    assert findings_of("rendering")[0].state is State.MISSING
-
-
 def test_a_check_that_fails_is_reported():
     def fails():
         raise RuntimeError("two\nlines")
@@ -181,23 +116,3 @@ def test_a_check_that_fails_is_reported():
     (needed,) = health.examine("simulator", fails)
     assert (needed.state, needed.says) == (State.BROKEN, "RuntimeError: two lines")
     assert next(iter(health.examine("meshes", fails))).state is State.MISSING
-
-
-@pytest.mark.parametrize(("state", "status"), [(State.MISSING, None), (State.BROKEN, 1)])
-def test_the_status_says_whether_the_main_job_runs(monkeypatch, capsys, state, status):
-    def check():
-        yield health.Finding("weights", state, "gone", "install them")
-
-    monkeypatch.setattr(health, "CHECKS", {"weights": check})
-    monkeypatch.setattr(cache, "is_cached", lambda *args, **parts: True)
-    command = cli.parse(["doctor"])
-    if status:
-        with pytest.raises(SystemExit) as end:
-            command()
-        assert end.value.code == status
-    else:
-        command()
-    printed = capsys.readouterr().out
-    assert "gone" in printed
-    assert "-> install them" in printed
-    assert printed.splitlines()[-1] == ("nothing can be searched here" if status else "searching works here")

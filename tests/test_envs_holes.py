@@ -1,6 +1,5 @@
 """Holes of the simulated depth camera: what is not measured, and what recognisers make of the rest."""
 
-import dataclasses
 from typing import get_args
 
 import jax
@@ -17,9 +16,7 @@ from mechsearch_jax.envs.camera.simulated_camera import BACKGROUND, observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
-from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.episode.slots import OneSlot
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.mismatch import ASSUMED, HolesName, Mismatch
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
@@ -69,12 +66,6 @@ def test_every_name_has_holes_and_none_is_as_before(world, image):
         Mismatch(holes="some")
 
 
-def test_holes_belong_to_an_episode():
-    seeds = [int(sensed("patches", *each).holes.seed) for each in ((SCENE, 0), (SCENE, 0), (SCENE, 1), (OPEN, 0))]
-    assert seeds[0] == seeds[1]
-    assert len(set(seeds)) == 3
-
-
 @pytest.fixture(scope="module")
 def compiled(world, image):
     """Which pixels are lost; compiled once, whatever the holes are."""
@@ -113,17 +104,6 @@ def test_patches_are_connected_and_take_their_share_of_the_shelf(image, compiled
     assert sizes[sizes >= least].sum() > 0.9 * lost.sum()
 
 
-def test_scattered_pixels_are_lost_in_clumps_and_singly(world):
-    part = dataclasses.replace(CAMERA, width=320, height=240)
-    image = observe(part, world, SHELF)
-    lost = np.asarray(jax.jit(lambda holes, *of: holes.of(part, *of))(drawn("scattered"), world, image))
-    assert lost.mean() == pytest.approx(0.3, abs=0.01)
-    numbers, _ = ndimage.label(lost)
-    sizes = np.bincount(numbers[lost])[1:]
-    assert (sizes == 1).sum() > 100
-    assert sizes[sizes >= 9].sum() > 0.5 * lost.sum()
-
-
 @pytest.mark.parametrize("factor", [1, 2])
 @pytest.mark.parametrize(
     ("near", "width"), [(0.6, WIDEST), (0.8, BASELINE * CAMERA.fx * 0.25), (0.94, NARROWEST), (1.0 - JUMP / 2, 0)]
@@ -134,13 +114,6 @@ def test_shadows_lie_on_the_left_and_are_as_wide_as_the_depth_differs(factor, ne
     lost = np.asarray(shadows(camera, depth))
     assert np.flatnonzero(lost[0]).tolist() == list(range(left - int(np.ceil(width / factor)), left))
     assert not lost[1].any()
-
-
-def test_shadows_of_a_scene_stay_beside_things(compiled):
-    lost = np.asarray(compiled(drawn("shadows")))
-    runs = np.diff(np.flatnonzero(np.diff(np.pad(lost, ((0, 0), (1, 1))).astype(int).reshape(-1)))[:])[::2]
-    assert 0.002 < lost.mean() < 0.08
-    assert np.median(runs) >= NARROWEST / 4
 
 
 def test_an_object_without_depth_has_none_at_every_look(world, image, compiled):
@@ -158,18 +131,6 @@ def test_an_object_without_depth_has_none_at_every_look(world, image, compiled):
     assert 0.2 * there < np.mean(counts) < 0.45 * there
     owner = np.asarray(image.segmentation)
     np.testing.assert_array_equal(compiled(holes), np.isin(owner, np.flatnonzero(blank)))
-
-
-def test_holes_are_as_large_in_a_thinned_image(world):
-    view = thinned_view(CAMERA, SHELF)
-
-    def lost(camera):
-        image = observe(camera, world, SHELF)
-        return jax.jit(lambda holes, *of: holes.of(camera, *of))(drawn("patches"), world, image)
-
-    full, thin = lost(CAMERA), lost(view.camera)
-    # The share is of another part of the image.
-    assert np.mean(np.asarray(view.of(full)) != np.asarray(thin)) < 0.05
 
 
 @pytest.mark.parametrize("recognise", [oracle, informed])
@@ -208,16 +169,6 @@ def test_masks_have_no_points_in_holes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["masks", "full"])
-def test_recognisers_see_no_target_without_depth(name):
-    recognise, world = recogniser(name, target_of(OPEN)), from_scenario(OPEN)
-    for holes in ("none", "target"):
-        seen = recognise(jax.random.key(0), Snapshot(CAMERA, SHELF, world, sensing=sensed(holes, OPEN)))
-        assert bool(seen.target_visible) is (holes == "none")
-        assert np.isfinite(np.asarray(seen.objects.position)).all()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["objects", "patches"])
 def test_episodes_with_holes_are_the_same_alone_and_in_a_batch(problem, name):
     starts = [Start(scene, seed, mismatch=Mismatch(holes=name)) for scene, seed in ((HIDDEN, 0), (TWO, 1), (OPEN, 2))]
@@ -229,22 +180,3 @@ def test_episodes_with_holes_are_the_same_alone_and_in_a_batch(problem, name):
             [(s.belief_size, s.found, s.truth_possible, s.around_possible) for s in e.steps] for e in (episode, again)
         ]
         assert what[0] == what[1]
-
-
-@pytest.mark.slow
-def test_slots_see_their_own_holes(problem):
-    world, mismatch = from_scenario(TWO), Mismatch(holes="objects")
-    sensings = [Start(TWO, seed, mismatch=mismatch).sensing(problem) for seed in range(4)]
-    worlds = jax.tree.map(lambda a: jnp.stack([a] * 4), world)
-    slots = ManySlots(problem, Method().policy(), oracle, worlds, 2, sensing=sensings[0])
-    slots.sense_by(dict(enumerate(sensings)))
-    keys = jax.random.split(jax.random.key(0), 4)
-    together = slots.look(worlds, keys, range(4))
-    valid = np.asarray(slots._state.search.observation.objects.valid)
-    assert len({tuple(row) for row in valid}) > 1
-    for row, sensing in enumerate(sensings):
-        one = OneSlot(problem, Method().policy(), oracle)
-        one.sense_by({0: sensing})
-        alone = one.look(jax.tree.map(lambda a: a[:1], worlds), keys[row : row + 1], [0])
-        np.testing.assert_array_equal(valid[row], one.state.observation.objects.valid)
-        assert (alone.size[0], alone.truth[0]) == (together.size[row], together.truth[row])

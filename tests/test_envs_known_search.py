@@ -1,7 +1,6 @@
 """The search with everything known: what it tries, what it keeps, when it gives up, and what it says of it."""
 
 import dataclasses
-from collections import Counter
 
 import jax
 import jax.numpy as jnp
@@ -10,83 +9,21 @@ import pytest
 from stage import BOX, HIDDEN, TWO
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
+from mechsearch_jax.actions import no_action, retrieve_action
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.known_target import search as known_search
 from mechsearch_jax.envs.known_target.judgement import InFullView, Judgement, judge
-from mechsearch_jax.envs.known_target.search import Frontier, KnownSearchConfig, Node, in_turn
+from mechsearch_jax.envs.known_target.search import KnownSearchConfig
 from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.simulator import Simulator
-from mechsearch_jax.envs.world.outcome import Failure, Outcome
-from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario
+from mechsearch_jax.envs.world.world import BODIES, from_scenario
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.grasping.retrieval import GraspChoice, best_grasp, best_grasps
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Sequences
 from mechsearch_jax.planner.rollout import present_state
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.shelf import Shelf
 
-START = jax.device_get(from_scenario(TWO))
 SEARCH = planner.planning_policy(objective=InFullView())
-
-
-@dataclasses.dataclass
-class Toy(Simulator):
-    """A simulator in which a push moves its object by its displacement, and a retrieval comes to what a test says.
-
-    Attributes:
-      retrieval: what comes of taking the target out.
-      tilts: whether a push of the target tips it over.
-    """
-
-    retrieval: Failure = Failure.NONE
-    tilts: bool = False
-    pushes: int = 0
-    engine: str = "Toy"
-    world: World | None = None
-
-    def replace(self, scenarios):
-        raise AssertionError("a search begins with one scenario")
-
-    def settle(self, active=None):
-        raise AssertionError("a search acts; it never just lets time pass")
-
-    def reset(self, scenarios):
-        return self.load(jax.tree.map(lambda a: a[None], from_scenario(scenarios[0])))
-
-    def load(self, world, only=None):
-        self.world = world
-        return world
-
-    def execute(self, actions, active=None):
-        position, rotation, count = np.array(self.world.position), np.array(self.world.rotation), len(active)
-        failure, retrieved = np.zeros(count, np.int32), np.zeros(count, bool)
-        for i in np.flatnonzero(active):
-            if actions.kind[i] == ActionKind.RETRIEVE:
-                failure[i], retrieved[i] = self.retrieval, self.retrieval is Failure.NONE
-                continue
-            self.pushes += 1
-            body = int(actions.object[i])
-            position[i, body] += actions.displacement[i]
-            if body == TARGET and self.tilts:
-                rotation[i, body] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-        self.world = self.world.replace(position=jnp.asarray(position), rotation=jnp.asarray(rotation))
-        fallen = np.array(self.world.valid & (self.world.position[..., 0] < Shelf().front))
-        flags = {name: np.zeros(count, bool) for name in ("held", "outside")}
-        return Outcome(
-            failure=failure, steps=np.ones(count, np.int32), settled=np.ones(count, bool),
-            restless=np.zeros_like(fallen), fallen=fallen,
-            retrieved=retrieved, overflow=np.zeros(count, np.int32), tracking_error=np.zeros(count), **flags,
-        )  # fmt: skip
-
-
-def push(body, **displacement):
-    moved = np.array([displacement.get(axis, 0.0) for axis in "xyz"], np.float32)
-    return jax.device_get(
-        no_action().replace(kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(body), displacement=jnp.asarray(moved))
-    )
 
 
 def sequences(*rows):
@@ -130,104 +67,6 @@ def search(problem, monkeypatch):
 
     run.rounds = []
     return run
-
-
-LEFT = push(0, y=0.1)
-
-
-def test_actions_are_joined_until_the_target_is_out(search):
-    simulator = Toy()
-    result = search(sequences((-0.5, LEFT), (-0.1, push(1, y=0.05))), simulator)
-    assert [(action.kind, action.object) for action in result.actions] == [("push", 0), ("push", 0), ("retrieve", None)]
-    assert result.rounds == 2
-    assert [number for number, _ in search.rounds] == [1, 2]
-    assert result.retrievals == Counter({"": 1})
-    assert result.simulated == simulator.pushes + 1
-    assert result.best.world.position[0, 1] == pytest.approx(0.335)
-    assert (result.start.judgement.least, result.best.judgement.least) == (1, 0)
-
-
-def test_a_whole_sequence_is_executed_and_each_world_of_it_looked_at(search):
-    result = search(sequences((-0.5, LEFT, LEFT, push(1, y=0.05))), Toy())
-    assert (result.rounds, len(result.actions), result.simulated) == (1, 3, 4)
-
-
-def test_there_are_no_more_actions_than_allowed(search):
-    for steps, solved in ((3, True), (2, False), (1, False)):
-        result = search(sequences((-0.5, LEFT, LEFT, LEFT)), Toy(), max_steps=steps)
-        assert (result.actions is not None) is solved
-        assert len(result.best.actions) <= steps - 1
-    # Where there is no room for any action, no round is spent on it.
-    assert result.rounds == 0
-
-
-def test_a_world_that_is_lost_is_given_up(search):
-    for sampled, simulator in (
-        (sequences((-0.5, push(1, x=-0.3), LEFT, LEFT)), Toy()),
-        (sequences((-0.5, push(TARGET, y=0.1), LEFT, LEFT)), Toy(tilts=True)),
-    ):
-        result = search(sampled, simulator)
-        assert result.actions is None
-        # Six rounds of one push each: nothing follows one after which something has fallen.
-        assert (result.simulated, result.rounds, len(result.best.actions)) == (6, 6, 0)
-
-
-def test_retrievals_that_fail_are_counted_and_solve_nothing(search):
-    result = search(sequences((-0.5, LEFT, LEFT)), Toy(retrieval=Failure.HELD_UP))
-    assert result.actions is None
-    assert set(result.retrievals) == {"the arm was held up"}
-    assert result.best.graspable
-
-
-def test_what_cannot_be_acted_upon_ends_when_the_rounds_do(search):
-    result = search(sequences((np.inf, LEFT)), Toy())
-    assert (result.actions, result.rounds, result.simulated) == (None, 6, 0)
-
-
-def test_the_same_first_action_is_executed_once(search):
-    rows = ((-0.5, push(1, y=0.02)), (-0.4, push(1, y=0.02)), (-0.2, push(1, y=0.04)))
-    simulator = Toy()
-    search(sequences(*rows), simulator, rounds=1)
-    assert simulator.pushes == 2
-
-
-def node(y, cost, actions=0):
-    position = np.array(START.position)
-    position[0, 1] = y
-    judgement = Judgement(np.float32(cost), np.zeros(1, bool), np.zeros((1, 8), bool))
-    return Node(START.replace(position=position), (None,) * actions, judgement)
-
-
-def test_a_frontier_gives_the_most_promising_worlds_and_lets_others_have_their_turn():
-    frontier = Frontier()
-    start, good, alike = node(0.0, 2.0), node(0.1, 1.5, 1), node(0.105, 1.0, 1)
-    for one in (start, good, alike):
-        frontier.add(one)
-    assert frontier.nodes == [start, good]
-    assert [frontier.next(1)[0] is good for _ in range(5)] == [True, True, False, True, False]
-    shorter, longer = Frontier(), node(0.2, 2.0, 2)
-    for one in (longer, start):
-        shorter.add(one)
-    assert shorter.next(2) == [start, longer]
-
-
-def test_proposals_of_every_kind_have_their_turn():
-    here, there = node(0.0, 2.0), node(0.1, 2.0)
-
-    def proposal(where, body, expected):
-        action = jax.tree.map(lambda a: a[None], push(body, y=0.1))
-        return known_search._Proposal(where, expected, action, 1)
-
-    easy = [proposal(here, 0, 0.1 * i) for i in range(5)]
-    others = [proposal(here, 1, 3.0), proposal(there, 0, 2.0)]
-    assert in_turn([*easy[::-1], *others], 4) == [easy[0], others[1], others[0], easy[1]]
-    assert in_turn([], 4) == []
-
-
-def test_settings_that_try_nothing_are_refused():
-    for name in ("simulated", "worlds", "rounds", "grasps", "retrievals", "max_steps"):
-        with pytest.raises(InputError, match=f"{name} 0 must be at least 1"):
-            KnownSearchConfig(**{name: 0})
 
 
 def test_a_target_that_may_stand_hidden_costs_no_more_for_it(problem):

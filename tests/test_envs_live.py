@@ -1,29 +1,24 @@
 """A search that is shown while it runs: what is on the page, and that nothing of the search changes."""
 
 import dataclasses
-import socket
 import threading
-import time
-import urllib.request
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from recordings import OBJECTS, SEQUENCES
-from stage import HIDDEN, OPEN, grab, idle
+from stage import HIDDEN, OPEN, idle
 from test_envs_viewer import free_port, node
 from test_search import IMAGES, searcher_of, seen
 
-from mechsearch_jax.actions import retrieve_action
-from mechsearch_jax.envs.recording.evidence import evidence_without_truth
 from mechsearch_jax.envs.recording.recording import Recording
 from mechsearch_jax.envs.recording.step_pictures import Painter
 from mechsearch_jax.envs.recording.step_values import trouble
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Decision
-from mechsearch_jax.planner.trials import TrialResult, nothing_tried, sequences_to_try
+from mechsearch_jax.planner.trials import TrialResult, sequences_to_try
 
 
 @pytest.fixture
@@ -95,16 +90,6 @@ def test_a_page_says_so_until_there_is_a_decision_and_then_shows_it_at_once(prob
     assert "taken for" in view.viewer.evidence
 
 
-def test_a_connection_that_a_browser_drops_unused_is_no_error(view, caplog):
-    """Browsers open some ahead of need."""
-    address = "127.0.0.1", view._server.get_port()
-    socket.create_connection(address).close()
-    with urllib.request.urlopen("http://{}:{}".format(*address), timeout=30):
-        pass
-    time.sleep(0.3)
-    assert "handshake failed" not in caplog.text
-
-
 def test_decisions_are_the_same_with_a_view_and_it_is_shown_each(problem):
     noting, steps = Noting(), []
     for view in (None, noting):
@@ -174,16 +159,3 @@ def test_what_cannot_be_drawn_does_not_stop_the_search(problem, view, monkeypatc
     with pytest.raises(RuntimeError, match="drawn wrong"):
         view.wait()
     assert "a step could not be shown" in caplog.text
-
-
-def test_the_grasps_of_a_found_target_are_those_where_it_is_believed(problem):
-    there = seen(OPEN)
-    belief = searcher_of(problem, OPEN).next(IMAGES.depth, IMAGES.colour).belief
-    decision = grab(jax.random.key(0), problem, belief, there).replace(
-        action=retrieve_action(jnp.eye(4), jnp.float32(0.0), jnp.float32(0.08))
-    )
-    found = evidence_without_truth(problem, belief, there, decision, nothing_tried())
-    np.testing.assert_array_equal(found.believed_pose, belief.found_pose)
-    assert len(found.hits)
-    nothing = belief.replace(found=jnp.array(False))
-    assert not len(evidence_without_truth(problem, nothing, there, None, nothing_tried()).hits)

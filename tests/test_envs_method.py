@@ -5,14 +5,12 @@ import json
 import pickle
 
 import pytest
-from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.store.rows import EpisodeRow, configuration, parse_row
+from mechsearch_jax.benchmarks.store.rows import EpisodeRow
 from mechsearch_jax.config.fixed import AS_IN_PAPER, FIXED
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
-from mechsearch_jax.envs.world.mismatch import Mismatch
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.planner import OPTIONS, PRESETS
@@ -58,18 +56,6 @@ def test_episodes_from_before_an_option_run_as_they_did():
         assert Method.of_options({**options, **former}).config == which()
     with pytest.raises(InputError, match="option draws is unknown to this version"):
         Method.of_options({**Method().options(), "draws": 3})
-
-
-def test_rows_from_before_a_name_say_it_by_the_new_one():
-    method = Method(config=PRESETS["standard"](trials="none"), mismatch=Mismatch(colour_noise=0.1))
-    options = method.options()
-    former = {"trials": "rehearsal", "mismatch.colour_noise": "mismatch.color_noise"}
-    before = {former.get(name, name): value for name, value in options.items()}
-    assert before != options
-    assert Method.of_options(before) == method
-    row = row_of("one", method, objects=2)
-    old = dataclasses.replace(row, configuration=configuration({**before, "simulator": "NativeSimulator"}))
-    assert parse_row(json.dumps(vars(old))) == row
 
 
 def test_what_is_no_option_tells_methods_apart_too():

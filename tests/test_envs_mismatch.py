@@ -1,42 +1,32 @@
 """Worlds that are not as the planner assumes: what the simulator and the camera make of a `Mismatch`."""
 
 import dataclasses
-import itertools
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from stage import HIDDEN, OPEN, Stage, grab
+from stage import HIDDEN, OPEN, grab
 
 from mechsearch_jax.actions import KINDS, ActionKind
-from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key, sensed_colour
 from mechsearch_jax.envs.camera.recognisers import recogniser
-from mechsearch_jax.envs.camera.sensing import Sensing, resized, sensing_of, true_camera
-from mechsearch_jax.envs.camera.sensors import Sensor
-from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.sensing import sensing_of, true_camera
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
-from mechsearch_jax.envs.episode.many_slots import ManySlots, _look
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.episode.slots import OneSlot
 from mechsearch_jax.envs.simulators.native import COARSE_STEP, FINE_STEP, PHYSICS, NativeSimulator, NativeWorld
-from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls, resampled
-from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
+from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, Mismatch
 from mechsearch_jax.envs.world.model import body_geometries
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
-from mechsearch_jax.geometry.superquadric import Superquadrics, empty
-from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.noise import no_noise
 from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import in_order
 from mechsearch_jax.workspace import scenario
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA, SHELF = Camera(), Shelf()
@@ -115,18 +105,6 @@ def test_each_body_has_a_friction_and_a_mass_of_its_own():
     np.testing.assert_allclose(heavier.body_inertia[slots], mass.body_mass[:, None] * usual.body_inertia[slots])
 
 
-def test_what_is_more_slippery_slides_farther():
-    """A body that is given a push over the board comes to rest sooner with twice its own friction."""
-    ways = []
-    for factor in (1.0, 2.0):
-        model, data = model_of(ASSUMED_CELL._replace(body_friction=np.full(BODIES, factor)))
-        start = data.joint("body0").qpos.copy()
-        data.joint("body0").qvel[:] = [0.0, -0.4, 0.0, 0.0, 0.0, 0.0]
-        mujoco.mj_step(model, data, nstep=300)
-        ways.append(np.linalg.norm(data.joint("body0").qpos[:2] - start[:2]))
-    assert ways[0] > 1.3 * ways[1] > 1e-3
-
-
 def test_directions_belong_to_scene_and_seed_not_to_lengths():
     near, far = (cell_of(Mismatch(shelf_shift=d, camera_shift=2 * d)) for d in (0.01, 0.02))
     np.testing.assert_allclose(2 * near.T_world_base[:3, 3], far.T_world_base[:3, 3], atol=1e-12)
@@ -192,34 +170,6 @@ def test_objects_are_recognised_as_large_as_their_spread_says_and_stand_where_th
     np.testing.assert_array_equal(cell_of(other).body_friction, cell_of(Mismatch(friction_spread=2.0)).body_friction)
 
 
-def test_a_lying_box_and_a_body_of_parts_stay_on_the_board():
-    turned = Rotation.from_euler("xyz", [[90.0, 0.0, 20.0], [0.0, 0.0, 70.0]], degrees=True).as_matrix()
-    half = np.array([[0.03, 0.04, 0.08], [0.05, 0.05, 0.05]])
-    scene = Superquadrics(
-        size=jnp.array(half, jnp.float32),
-        exponents=jnp.full((2, 2), 0.2),
-        position=jnp.array([[0.5, 0.1, 0.44], [0.6, -0.1, 0.45]], jnp.float32),
-        rotation=jnp.array(turned, jnp.float32),
-        valid=jnp.ones(2, bool),
-    )
-    factors = np.array([[0.96, 1.05, 1.02], [1.03, 0.97, 1.04]], np.float32)
-    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
-
-    def lowest(objects):
-        corners = signs[None] * np.asarray(objects.size)[:, None]
-        return (np.asarray(objects.position)[:, None] + corners @ turned.transpose(0, 2, 1))[..., 2].min(axis=1)
-
-    larger = resized(scene, Sensing(sizes=factors))
-    np.testing.assert_allclose(larger.size, half * factors, rtol=1e-6)
-    np.testing.assert_allclose(lowest(larger), lowest(scene), atol=1e-6)
-    pieces = empty(2, 2).parts.replace(size=jnp.full((2, 2, 3), 0.02), position=jnp.full((2, 2, 3), 0.01))
-    both = resized(scene.replace(parts=pieces), Sensing(sizes=factors))
-    mean = np.exp(np.log(factors).mean(axis=1))
-    np.testing.assert_allclose(both.parts.size, 0.02 * np.broadcast_to(mean[:, None, None], (2, 2, 3)), rtol=1e-5)
-    np.testing.assert_allclose(both.parts.position, 0.5 * both.parts.size, rtol=1e-5)
-    np.testing.assert_allclose(both.size, half * mean[:, None], rtol=1e-5)
-
-
 @pytest.mark.parametrize("mismatch", [Mismatch(camera_turn=2.0, camera_shift=0.02), Mismatch(shelf_turn=2.0)])
 def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
     masks = dataclasses.replace(recogniser("masks", target_of(SCENE)), noise=no_noise)
@@ -246,19 +196,6 @@ def beyond(rotation, position, world, slot, points):
     return (np.abs(local) - half).max(axis=1)
 
 
-@pytest.mark.slow
-def test_a_camera_that_is_shifted_shifts_recognised_poses():
-    masks = recogniser("masks", target_of(SCENE))
-    shift = Mismatch(camera_shift=0.03)
-    seen, truth = (masks(jax.random.key(0), snapshot(mismatch)).objects for mismatch in (shift, ASSUMED))
-    way = -cell_of(shift).T_base_moved[:3, 3]
-    both = np.asarray(seen.valid & truth.valid)
-    assert both.any()
-    # Recognised objects stand on the board, wherever they seem to be.
-    offset = np.median(np.asarray(seen.position - truth.position)[both], axis=0)
-    np.testing.assert_allclose(offset[:2], way[:2], atol=0.01)
-
-
 def test_depth_noise_and_missing_depth_are_as_given():
     masks = recogniser("masks", target_of(SCENE))
 
@@ -276,32 +213,6 @@ def test_depth_noise_and_missing_depth_are_as_given():
     assert missing[there].mean() == pytest.approx(0.2, abs=0.01)
     # The other pixels measure what they do without.
     np.testing.assert_allclose(lost[there & ~missing], usual[there & ~missing], atol=1e-6)
-
-
-def test_exposure_and_noise_of_colour_are_as_given():
-    full, view = recogniser("full", target_of(SCENE)), shelf_view(CAMERA, SHELF)
-    world = from_scenario(SCENE)
-    appearance = drawn_appearance(scene_key(world), full.target_colour, 40.0)
-    plain = observe(view.camera, world, SHELF, appearance).colour
-    for mismatch in (Mismatch(exposure=0.5), Mismatch(exposure=1.5, colour_noise=8 / 255, white_balance=0.1)):
-        seen = np.asarray(sensed_colour(jax.random.key(1), plain, sensed(mismatch).colour))
-        assert seen.min() >= 0.0
-        assert seen.max() <= 1.0
-        np.testing.assert_allclose(255 * seen, np.round(255 * seen), atol=1e-4)
-        balance = 1.0 + mismatch.white_balance * np.array([1.0, 0.0, -1.0])
-        expected = mismatch.exposure * balance * np.asarray(plain)
-        inside = (expected > 0.2) & (expected < 0.8)
-        error = (seen - expected)[inside]
-        assert np.mean(error) == pytest.approx(0.0, abs=2e-4)
-        assert np.std(error) == pytest.approx(mismatch.colour_noise, rel=0.03)
-
-
-def test_whether_a_pixel_is_lost_does_not_depend_on_its_noise():
-    camera, depth = dataclasses.replace(CAMERA, width=300, height=300), jnp.full((300, 300), 0.7)
-    measured = Sensor(scatter=np.float32(0.001), missing=np.float32(0.3))(jax.random.key(0), camera, depth)
-    distance = np.linalg.norm(np.asarray(measured - back_project(camera, depth)), axis=-1)
-    assert np.isnan(distance).mean() == pytest.approx(0.3, abs=0.01)
-    assert np.sqrt(np.nanmean(distance**2)) == pytest.approx(0.001, rel=0.02)
 
 
 def test_what_cannot_be_simulated_is_refused():
@@ -351,15 +262,6 @@ def test_recognisers_without_an_image_refuse_other_depth(eyes):
             eyes(jax.random.key(0), snapshot(mismatch))
 
 
-def test_rows_keep_what_differs_alone():
-    assert Method(mismatch=Mismatch()).options() == Method().options()
-    method = Method(recognition="masks", mismatch=Mismatch(friction=2, camera_turn=1.5, physics="soft-contacts"))
-    added = {name: value for name, value in method.options().items() if name not in Method().options()}
-    assert added == {"mismatch.friction": 2.0, "mismatch.camera_turn": 1.5, "mismatch.physics": "soft-contacts"}
-    assert Method.of_options(method.options()) == method
-    assert set(MISMATCH_OPTIONS) == {f.name for f in dataclasses.fields(Mismatch)}
-
-
 def test_what_is_data_compiles_nothing():
     def compile_key(**mismatch):
         return Method(recognition="masks", mismatch=Mismatch(**mismatch)).compile_key()
@@ -388,12 +290,6 @@ def test_every_world_of_a_simulator_has_its_own_cell():
     np.testing.assert_array_equal(simulator._worlds[0]._model.geom_friction[:, 0], frictions[1])
 
 
-def test_another_simulator_refuses_another_cell(problem):
-    starts = [Start(HIDDEN, 0, mismatch=Mismatch(mass=2.0))]
-    with pytest.raises(InputError, match="Stage: cannot differ"):
-        run_episodes(starts, problem, Method().policy(), Stage(), 1, Listeners(lambda ended: None))
-
-
 def waving():
     """A motion of 0.4 s in steps of 4 ms, in which every joint's angle is the sine of the time."""
     t = 0.004 * np.arange(1, 101)
@@ -407,17 +303,6 @@ def waving():
         closed=np.int32(50),
         opens=np.int32(100),
     )
-
-
-def test_a_reference_may_have_other_steps():
-    reference = waving()
-    assert resampled(reference, 0.004, 0.004) is reference
-    for step in (0.002, 0.005):
-        other = resampled(reference, 0.004, step)
-        rows = round(0.4 / step)
-        assert (int(other.length), int(other.closed), int(other.opens)) == (rows, rows // 2, rows)
-        np.testing.assert_allclose(other.q[:, 3], np.sin(step * np.arange(1, rows + 1)), atol=1e-5)
-        assert controls(other).shape == (rows, 9)
 
 
 def test_with_the_usual_physics_no_reference_is_resampled(monkeypatch):
@@ -445,45 +330,6 @@ def test_physics_change_the_model():
     assert changed["soft-friction"].opt.impratio == 1.0
     assert (changed["soft-contacts"].geom_solref[:, 0] > usual.geom_solref[:, 0]).all()
     assert usual.opt.timestep == changed["usual"].opt.timestep == 0.004
-
-
-@pytest.mark.parametrize("name", PHYSICS)
-def test_all_physics_come_to_rest(name):
-    world = NativeWorld()
-    world.reset(SCENE, cell_of(Mismatch(physics=name)))
-    outcome = world.settle()
-    assert outcome.settled
-    assert not outcome.fallen.any()
-    before = from_scenario(SCENE)
-    shift = np.linalg.norm(np.asarray(world.world.position - before.position), axis=1)[np.asarray(before.valid)]
-    assert shift.max() < 0.003
-
-
-def seen_in(slots, problem, world, mismatches):
-    """The poses that slots see at once, of a mismatch each."""
-    slots.sense_by({row: Start(SCENE, 0, mismatch=m).sensing(problem) for row, m in enumerate(mismatches)})
-    summary = slots.look(world, jax.random.split(jax.random.key(0), len(mismatches)), range(len(mismatches)))
-    return slots._state.search.observation.objects.position, summary
-
-
-@pytest.mark.slow
-def test_every_slot_senses_by_itself_and_numbers_compile_nothing(problem):
-    mismatches = [Mismatch(camera_shift=0.01, shelf_shift=0.02), Mismatch(camera_shift=0.03)]
-    world = jax.tree.map(lambda a: jnp.stack([a, a]), from_scenario(SCENE))
-    slots = ManySlots(problem, Method().policy(), oracle, world, 2)
-    many, summary = seen_in(slots, problem, world, mismatches)
-    for row, mismatch in enumerate(mismatches):
-        one = OneSlot(problem, Method().policy(), oracle)
-        one.sense_by({0: Start(SCENE, 0, mismatch=mismatch).sensing(problem)})
-        alone = one.look(jax.tree.map(lambda a: a[:1], world), jax.random.split(jax.random.key(0), 1), [0])
-        np.testing.assert_allclose(many[row], one.state.observation.objects.position, atol=1e-6)
-        assert (alone.size[0], alone.truth[0]) == (summary.size[row], summary.truth[row])
-    compiled = _look.jitted._cache_size()
-    other, _ = seen_in(slots, problem, world, [Mismatch(camera_turn=1.0)] * 2)
-    assert np.abs(np.asarray(other - many)).max() > 1e-3
-    assert _look.jitted._cache_size() == compiled
-    with pytest.raises(InputError, match="mismatches of one run that differ in more than numbers"):
-        seen_in(slots, problem, world, [mismatches[0], ASSUMED])
 
 
 @pytest.mark.slow

@@ -11,22 +11,21 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
-from test_envs_simulator import BOARD, pick_and_place, pose, push, scene, standing, take_out
+from test_envs_simulator import pick_and_place, pose, push, scene, standing, take_out
 
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
-from mechsearch_jax.envs.simulators import mjx_step, simulator, warp_kernels
+from mechsearch_jax.envs.simulators import mjx_step, simulator
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import model
 from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, Mismatch, TrueCell
-from mechsearch_jax.envs.world.outcome import Failure, Overflow
+from mechsearch_jax.envs.world.outcome import Overflow
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, slots
-from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import prepare
 from mechsearch_jax.workspace.camera import Camera
@@ -117,28 +116,6 @@ def test_actions_of_two_kinds_are_mixed_by_world():
 
 
 @pytest.mark.slow
-def test_where_kinds_are_traced_an_unknown_one_fails_in_its_own_row():
-    """What the compiled functions make of the kinds, without stepping anything."""
-    world = stack(*[from_scenario(scene(BOX))] * 4)
-    fields = {"ctrl": jnp.zeros((4, 9)), "qpos": jnp.zeros((4, 9 + 7 * 9))}
-    kinds = jnp.int32([ActionKind.NONE, 9, ActionKind.PUSH, -1])
-    actions = stack(no_action(), sideways(), sideways(), sideways()).replace(kind=kinds)
-
-    @jax.jit
-    def judged(actions, world):
-        data, config = types.SimpleNamespace(**fields), SimulatorConfig()
-        task, _ = mjx_step.acting(data, actions, jnp.ones(4, bool), jnp.zeros(9), config)
-        progress = mjx_step.begin(task, data)
-        in_hand = jnp.ones(4, bool)
-        return task.moves, mjx_step.verdicts(Shelf(), config, task, progress, world, data.qpos, in_hand)[1]
-
-    moves, outcome = judged(actions, world)
-    assert moves.tolist() == [False, False, True, False]
-    assert [outcome.reason(i) for i in range(4)] == [None, "unknown", None, "unknown"]
-    assert not outcome.retrieved.any()
-
-
-@pytest.mark.slow
 def test_a_retrieval_fails_when_the_arm_is_held_up_and_by_what_falls_meanwhile():
     """What the compiled functions make of the states before and after, without stepping anything: in the first world
     nothing happens, then the box falls, then it had fallen before, then the arm is held up, twice in worlds that also
@@ -176,12 +153,6 @@ def test_without_warp_one_line_tells_what_to_install(monkeypatch):
     with pytest.raises(InputError, match=r"pip install 'mechsearch-jax\[gpu\]'") as complaint:
         MjxSimulator()
     assert "\n" not in str(complaint.value)
-
-
-@pytest.mark.parametrize("name", ["contacts", "rows", "compound_contacts", "compound_rows"])
-def test_a_capacity_of_nothing_is_refused(name):
-    with pytest.raises(InputError, match=f"{name} 0 must be at least 1"):
-        MjxConfig(**{name: 0})
 
 
 @pytest.fixture(scope="module")
@@ -318,29 +289,6 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
 
 
 @pytest.mark.slow
-@pytest.mark.always
-def test_who_compiles_kernels_says_where_it_cannot(tmp_path, monkeypatch):
-    import warp
-
-    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
-    wait = warp_kernels.compile_kernels(model.compile_model(Shelf(), Camera(), 0.004), ("nothing",), 2, 128, 320, "cpu")
-    with pytest.warns(UserWarning, match="kernels are compiled one by one when they are needed: .*nothing"):
-        wait()
-    assert not list(tmp_path.iterdir())
-
-
-def test_kernels_that_were_compiled_are_not_compiled_again(tmp_path, monkeypatch):
-    import warp
-
-    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(warp_kernels.sys, "executable", "true")
-    arguments = model.compile_model(Shelf(), Camera(), 0.004), ("geom_size",), 2, 128, 320, "cpu"
-    warp_kernels.compile_kernels(*arguments)()
-    assert warp_kernels.compile_kernels(*arguments) is None
-    assert warp_kernels.compile_kernels(*arguments[:2], 3, *arguments[3:]) is not None
-
-
-@pytest.mark.slow
 def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
     picked = pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.22, 0.1))
     off_the_board = pick_and_place(pose(0.596, 0.1, 0.1), pose(0.39, 0.1, 0.1))
@@ -382,47 +330,6 @@ def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
 
 
 @pytest.mark.slow
-def test_a_hand_touches_a_box_as_it_does_in_the_native_simulator(sim):
-    """The same contacts with the same distances and normals, at many moments of a pick-and-place."""
-    single = NativeWorld(config=SimulatorConfig(trace_every=8))
-    single.reset(scene(BOX))
-    single.execute(pick_and_place(pose(0.516, 0.1, 0.08), pose(0.466, 0.22, 0.08)))
-    trace = single.trace
-    bodies = np.concatenate([trace.position, trace.quaternion], axis=-1).reshape(len(trace.time), -1)
-    moments = np.concatenate([trace.q, trace.fingers, bodies], axis=1).astype(np.float32)
-    sim.reset([scene(BOX)] * len(moments))
-    contacts = jax.device_get(jax.jit(sim._model.step)(sim._fields, sim._data.replace(qpos=jnp.asarray(moments)))._impl)
-
-    native, box = single._model, single._model.geom("box0").id
-    touching, odd = 0, []
-    for i, moment in enumerate(moments):
-        data = mujoco.MjData(native)
-        data.qpos[:] = moment
-        mujoco.mj_fwdPosition(native, data)
-        both = np.stack([data.contact.geom1, data.contact.geom2], axis=1)
-        here = np.flatnonzero(contacts.contact__worldid[: contacts.nacon[0]] == i)
-        batch_contacts = (
-            (both, data.contact.dist, data.contact.frame[:, :3]),
-            (contacts.contact__geom[here], contacts.contact__dist[here], contacts.contact__frame[here, 0]),
-        )
-        # Pairs, distances [mm] and normals of what touches the box, but for the board.
-        rows = []
-        for pairs, distance, normal in batch_contacts:
-            of_box = (pairs == box).any(axis=1) & (native.geom_type[pairs] != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
-            value = np.concatenate([pairs, 1e3 * distance[:, None], normal], axis=1)[of_box]
-            rows.append(value[np.lexsort(value[:, 2::-1].T)])
-        touching += len(rows[0])
-        # A contact that is about to begin or to end may be there in one of them only.
-        counts = [len(row) for row in rows]
-        if counts[0] == counts[1]:
-            np.testing.assert_allclose(rows[0], rows[1], atol=5e-3)
-        else:
-            odd.append((i, counts))
-    assert touching > 100
-    assert len(odd) <= 1, odd
-
-
-@pytest.mark.slow
 def test_a_world_that_diverges_touches_no_other(sim):
     """One world's mass is not a number: it gets its state back, and its neighbours never notice."""
     starts, actions = [scene(BOX)] * 3, stack(*[sideways()] * 3)
@@ -459,16 +366,3 @@ def test_what_overflows_is_reported(config, flag):
     overflow = small.follow(hold).overflow
     assert int(overflow[0]) & flag
     assert bool(int(overflow[1]) & flag) == (flag is Overflow.CONTACTS)
-
-
-@pytest.mark.slow
-def test_worlds_come_to_rest():
-    """What hangs in the air falls onto the board and stays there, each in its own time."""
-    quick = MjxSimulator(config=MjxConfig(simulator=SimulatorConfig(motion=MotionConfig(waypoints=5))))
-    low, high = (dataclasses.replace(BOX, position=(0.6, 0.1, BOARD + 0.054 + drop)) for drop in (0.0, 0.03))
-    quick.reset([scene(low), scene(high)])
-    outcomes = quick.settle()
-    assert outcomes.settled.all()
-    assert outcomes.failure.tolist() == [Failure.NONE, Failure.NONE]
-    assert 0 < int(outcomes.steps[0]) < int(outcomes.steps[1])
-    np.testing.assert_allclose(quick.world.position[:, 0, 2], BOARD + 0.054, atol=5e-4)

@@ -6,36 +6,24 @@ import io
 import re
 from html.parser import HTMLParser
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 from recordings import (
     EPISODE,
     LOST,
-    OBJECTS,
     POSES,
     PUSH,
     RECORDING,
-    RETRIEVAL,
-    SLOTS,
     STEPS,
     evidence,
     record,
-    stacked,
 )
-from scipy.spatial.transform import Rotation
-from stage import HIDDEN
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.page import page as pages
-from mechsearch_jax.envs.page.page import page, save_page, stamp
+from mechsearch_jax.envs.page.page import page, stamp
 from mechsearch_jax.envs.recording.recording import NAME, save_recording
-from mechsearch_jax.envs.recording.sampled import Sampled
-from mechsearch_jax.envs.recording.step_pictures import Painter
-from mechsearch_jax.envs.recording.step_values import ending, last_world, step_values
-from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.planner.trials import TrialResult, TriedActions
+from mechsearch_jax.envs.recording.step_values import ending, step_values
 from mechsearch_jax.runtime.errors import InputError
 
 VOID = {"img", "meta", "link", "br"}
@@ -126,21 +114,6 @@ def test_a_page_shows_the_values_of_the_recording(text):
     assert "actions 1 of at most 1" in words
 
 
-def test_recognised_shapes_stand_beside_the_true_ones():
-    (shape,) = step_values(LOST, 0).shapes
-    assert (shape.number, shape.words) == (0, "box, 10 × 6 × 16 cm")
-    assert shape.confidence == pytest.approx(0.9)
-    assert shape.off == pytest.approx(0.0, abs=1e-6)
-    assert 0.0 <= step_values(LOST, 0).unexplained < 0.1
-    nothing = dataclasses.replace(STEPS[0], scene=OBJECTS.replace(valid=np.zeros(SLOTS, bool)))
-    values = step_values(dataclasses.replace(LOST, steps=(nothing, STEPS[1])), 0)
-    assert [shape.words for shape in values.shapes] == ["not recognised"]
-    assert values.unexplained > 0.9
-    oracle = dataclasses.replace(EPISODE, config={**EPISODE.config, "recognition": "oracle"})
-    given = step_values(dataclasses.replace(LOST, episode=oracle), 0)
-    assert (given.shapes, given.unexplained) == ((), None)
-
-
 def test_what_the_belief_and_the_action_are_wrong_about_is_a_warning():
     def of(**changes):
         steps = (dataclasses.replace(EPISODE.steps[0], **changes), EPISODE.steps[1])
@@ -160,35 +133,6 @@ def test_what_the_belief_and_the_action_are_wrong_about_is_a_warning():
     assert (values.poses, values.warnings) == (1, ("something else is taken for the target",))
 
 
-def test_what_an_action_moved_and_tilted_is_a_value():
-    world = STEPS[1].world
-    position, rotation = np.array(world.position), np.array(world.rotation)
-    position[0, 1] += 0.05
-    rotation[TARGET] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    turned = dataclasses.replace(STEPS[1], world=world.replace(position=position, rotation=rotation))
-    recording = dataclasses.replace(LOST, steps=(STEPS[0], turned))
-    assert step_values(recording, 0).moved == ("object 0 by 5.0 cm", "the target by 0.0 cm, tilted by 90°")
-    assert step_values(recording, 1).warnings == ("the target fell over",)
-    # Where it no longer stands it is not drawn as if it did.
-    painter = Painter(recording)
-    frames = [pages.recorded_frame(step, LOST.camera, LOST.shelf) for step in (STEPS[1], turned)]
-    stands, lies = (painter.believed(s, f) for s, f in zip((STEPS[1], turned), frames, strict=True))
-    assert (stands != lies).any()
-
-
-def test_changes_of_f_are_counted():
-    before = np.arange(POSES) % 2 == 0
-    now = before.copy()
-    now[0], now[1] = False, True
-    steps = [
-        dataclasses.replace(step, found=False, evidence=evidence(), existence=existence)
-        for step, existence in zip(STEPS, (before, now), strict=True)
-    ]
-    recording = dataclasses.replace(LOST, steps=tuple(steps))
-    assert [(v.ruled_out, v.opened) for v in (step_values(recording, i) for i in range(2))] == [(None, None), (1, 1)]
-    assert "since the step before 1 ruled out, 1 opened again" in Parsed(page(recording)).words
-
-
 def test_endings_are_those_of_the_record():
     def of(**changes):
         return ending(dataclasses.replace(LOST, episode=dataclasses.replace(EPISODE, **changes)))
@@ -201,45 +145,6 @@ def test_endings_are_those_of_the_record():
     out = of(retrieved=True, failure=None, steps=(record(PUSH, at_rest=False), leans))
     assert out[:2] == (True, "the target is out after 2 actions; object 0 leans on the back wall")
     assert ending(RECORDING)[:2] == (None, "retrieved")
-
-
-def test_a_policy_that_minds_no_cost_is_shown_none():
-    kept = STEPS[0].sampled
-    flat = dataclasses.replace(kept, value=np.zeros(len(kept)), cost=np.zeros(len(kept)))
-    free = dataclasses.replace(EPISODE.steps[0], cost=0.0, predicted_cost=0.0, observed_cost=0.0)
-    episode = dataclasses.replace(EPISODE, steps=(free, EPISODE.steps[1]))
-    steps = (dataclasses.replace(STEPS[0], sampled=flat), STEPS[1])
-    values = step_values(dataclasses.replace(LOST, steps=steps, episode=episode), 0)
-    assert (values.cost, values.predicted, values.measured) == (None, None, None)
-    assert [(c.role, c.value, c.cost) for c in values.candidates] == [("chosen", None, None)]
-
-
-def test_trials_that_read_alike_are_counted_and_a_retrieval_compares_nothing():
-    tried = TriedActions(stacked(RETRIEVAL, RETRIEVAL), np.array([TrialResult.UNSURE] * 2, np.int32))
-    last = dataclasses.replace(STEPS[1], action=RETRIEVAL, evidence=evidence(found=True, tried=tried))
-    won = dataclasses.replace(EPISODE, retrieved=True, failure=None, steps=(EPISODE.steps[0], record(RETRIEVAL)))
-    recording = dataclasses.replace(LOST, steps=(STEPS[0], last), episode=won)
-    values = step_values(recording, 1)
-    assert [(trial.count, trial.chosen) for trial in values.trials] == [(2, True)]
-    assert (values.candidates, values.outcome) == ((), "the target was taken out")
-    words = Parsed(page(recording)).words
-    assert "take the target out, 2 ways succeeded here, but not in every scene nearby" in words
-    assert "1 of at most 1, and 1 to take it out" in words
-
-
-def test_the_best_that_moves_another_object_stands_beside_the_next_best():
-    def roles(*objects):
-        action = stacked(*(PUSH.replace(object=np.int32(i), q7=np.float32(k)) for k, i in enumerate(objects)))
-        places = [np.stack([np.asarray(a)] * len(objects)) for a in (OBJECTS.position, OBJECTS.rotation)]
-        several = Sampled(action, -np.arange(len(objects), 0.0, -1), np.full(len(objects), 90.0), *places)
-        step = dataclasses.replace(STEPS[0], sampled=several, action=several.single(0))
-        shown = step_values(dataclasses.replace(LOST, steps=(step, STEPS[1])), 0).candidates
-        return [(candidate.role, candidate.words[:13], candidate.poses) for candidate in shown]
-
-    first, second = ("chosen", "push object 0", POSES), ("next best", "push object 0", POSES)
-    assert roles(0, 0, 2, 3) == [first, second, ("best of another object", "push object 2", None)]
-    assert roles(0, 2, 0) == [first, ("next best", "push object 2", POSES)]
-    assert roles(0) == [first]
 
 
 def test_what_an_earlier_recording_lacks_is_left_out_with_a_sentence():
@@ -259,40 +164,6 @@ def test_what_is_shown_is_escaped():
     assert text.count("alert(1)") >= 5
     assert "<script" not in text
     Parsed(text)
-
-
-def test_the_last_state_is_that_after_the_last_action():
-    moved = last_world(RECORDING.steps[0])
-    np.testing.assert_allclose(moved.position[0, 1] - RECORDING.steps[0].world.position[0, 1], 0.1, atol=1e-5)
-    np.testing.assert_allclose(moved.rotation[0], np.eye(3), atol=1e-6)
-    assert last_world(RECORDING.steps[1]) is RECORDING.steps[1].world
-    empty = jax.tree.map(np.asarray, from_scenario(HIDDEN))
-    gone = dataclasses.replace(STEPS[1], world=empty.replace(valid=np.zeros(len(empty.valid), bool)))
-    assert (Painter(LOST).end() != Painter(dataclasses.replace(LOST, steps=(STEPS[0], gone))).end()).any()
-
-
-def test_the_command_writes_the_page(tmp_path, capsys):
-    save_recording(LOST, tmp_path / NAME)
-    cli.parse(["view", str(tmp_path), "--save", str(tmp_path / "pages" / "page.html")])()
-    assert "no grasp of it is free" in (tmp_path / "pages" / "page.html").read_text(encoding="utf-8")
-    assert "page.html" in capsys.readouterr().out
-
-
-def test_a_film_is_shown_from_where_it_lies(tmp_path, text):
-    save_page(LOST, tmp_path / "pages" / "page.html", tmp_path / "films" / "a film.mp4")
-    filmed = (tmp_path / "pages" / "page.html").read_text(encoding="utf-8")
-    assert '<video controls muted playsinline preload="metadata" src="../films/a%20film.mp4">' in filmed
-    assert "<video" not in text
-    assert '<img src="film.webp" alt="The film' in page(LOST, "film.webp")
-
-
-def test_a_page_that_cannot_be_made_leaves_what_was_there(tmp_path, monkeypatch):
-    (tmp_path / "page.html").write_text("before")
-    monkeypatch.setattr(pages, "page", lambda *arguments: (_ for _ in ()).throw(RuntimeError("drawn wrong")))
-    with pytest.raises(RuntimeError):
-        save_page(LOST, tmp_path / "page.html")
-    assert (tmp_path / "page.html").read_text() == "before"
-    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_bad_input_is_refused_in_one_line(tmp_path):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
 
-from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.dynamics import named as push_models
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs.pushing import physics_push
@@ -20,8 +19,7 @@ from mechsearch_jax.envs.pushing.pushes import push_simulation
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario, superquadrics
 from mechsearch_jax.geometry import superquadric, transforms
-from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Config, PlannerConfig, initial_belief, prediction, search_for_grasp, update_belief
+from mechsearch_jax.planner import Config
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.workspace.shelf import Shelf
@@ -34,8 +32,6 @@ START = scene(
     target=standing("cylinder", (0.02, 0.02, 0.05), 0.7, -0.15),
 )
 SCENE = superquadrics(from_scenario(START))
-# At rest too, but such that it falls over when it is pushed.
-TALL = superquadrics(from_scenario(scene(standing("box", (0.03, 0.012, 0.096), 0.55, 0.1))))
 
 
 def sideways(x, distance, z=0.04):
@@ -113,54 +109,6 @@ def test_alone_it_is_as_in_a_batch(outcome):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=5e-3), one, outcome)
 
 
-@pytest.mark.slow
-def test_two_maps_are_one_call(outcome, monkeypatch):
-    simulate, calls = physics_push.simulate_pushes, []
-
-    def counted(*arguments):
-        calls.append(np.shape(arguments[-1]))
-        return simulate(*arguments)
-
-    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
-    model = NativePhysics(threads=3)
-
-    def one(action):
-        return model(SHELF, SCENE, PUSHER, action.T_world_gripper, action.displacement, action.q7)
-
-    square = jax.tree.map(lambda a: a.reshape(2, 2, *a.shape[1:]), PUSHES)
-    twice_mapped = jax.jit(jax.vmap(jax.vmap(one)))(square)
-    assert calls == [(2, 2)]
-    flat = jax.tree.map(lambda a: a.reshape(4, *a.shape[2:]), twice_mapped)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-4), flat, outcome)
-
-
-@pytest.mark.slow
-def test_only_the_first_action_of_a_sequence_is_simulated(monkeypatch):
-    simulate, calls = physics_push.simulate_pushes, []
-
-    def counted(*arguments):
-        calls.append(np.shape(arguments[-1]))
-        return simulate(*arguments)
-
-    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
-    first, later = NativePhysics(threads=4), QuasiStatic()
-
-    # As `plan` does it: a scan over time, and within it a map over sequences.
-    def step(scenes, time):
-        model = prediction._either(time == 0, first, later)
-
-        def one(scene, action):
-            return model(SHELF, scene, PUSHER, action.T_world_gripper, action.displacement, action.q7).scene
-
-        return jax.vmap(one)(scenes, PUSHES), None
-
-    plan = jax.jit(lambda scenes: jax.lax.scan(step, scenes, jnp.arange(3))[0])
-    for count in (1, 2):
-        jax.block_until_ready(plan(copies(SCENE)))
-        assert calls == [(4,)] * count
-    assert prediction._either(jnp.array(True), later, QuasiStatic()) is later
-
-
 def test_an_error_stays_in_its_row(outcome, tmp_path, monkeypatch):
     # Where MuJoCo writes its log of what diverged.
     monkeypatch.chdir(tmp_path)
@@ -184,14 +132,6 @@ def test_a_push_out_of_reach_fails_and_one_of_no_length_does_nothing(outcome):
     assert np.isinf(result.residual).tolist() == [True, False, False, False]
     np.testing.assert_array_equal(result.scene.position[:2], [SCENE.position] * 2)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[2:], b[2:]), result, outcome)
-
-
-def test_what_falls_over_is_reported(outcome):
-    high = push(pose(0.555, 0.058, 0.15, tilt=math.radians(30)), (0.0, 0.1, 0.0))
-    result = predicted(copies(TALL), copies(high))
-    assert (result.residual == 0).all()
-    assert (result.topples[:, 0] == 1).all()
-    assert (result.topples[:, 1:] == 0).all()
 
 
 def test_shapes_that_overlap_come_to_rest_before_they_are_pushed():
@@ -241,17 +181,6 @@ def test_every_name_stands_for_models(monkeypatch):
             refuse("guess")
 
 
-def test_missing_weights_are_one_line(tmp_path, monkeypatch):
-    from mechsearch_jax.dynamics import learned as learned_push
-
-    monkeypatch.setattr(learned_push.importlib.resources, "files", lambda package: tmp_path)
-    with pytest.raises(
-        InputError, match=r'push model "learned" cannot be used: .*networks/push.* `mechsearch train push`'
-    ) as error:
-        push_models.own_push_model.__wrapped__("learned")
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.slow
 def test_the_batch_simulator_predicts_what_the_native_one_does(outcome):
     # In a map within a map, as in a batch of plans; one of the four rows is no scene.
@@ -274,67 +203,7 @@ def test_the_batch_simulator_predicts_what_the_native_one_does(outcome):
     np.testing.assert_array_equal(outcomes.scene.position[1], nan.position[None].repeat(2, 0))
 
 
-def seen(problem):
-    """The belief and the observation where the objects of `SCENE` are seen, and the target is not."""
-    observation = Observation(jax.tree.map(lambda a: a[:8], SCENE), jnp.array(False), jnp.zeros(3))
-    return update_belief(problem, initial_belief(problem), observation), observation
-
-
 def pushing(problem):
     """The problem where nothing but pushes can be done."""
     actions = dataclasses.replace(problem.config.actions, actions=("push",))
     return problem.replace(config=dataclasses.replace(problem.config, actions=actions))
-
-
-@pytest.mark.slow
-def test_each_draw_of_a_first_action_is_simulated_once_and_nothing_else(problem, monkeypatch):
-    problem, simulate, calls, redraws_fail = pushing(problem), physics_push.simulate_pushes, [], False
-
-    def counted(*arguments):
-        simulated = simulate(*arguments)
-        calls.append(np.asarray(arguments[-1]))
-        # Sequence 0 never gets an action, and no other one in a second draw.
-        fails = (np.arange(6) == 0) | (len(calls) > 1)
-        return simulated.replace(failed=simulated.failed | fails) if redraws_fail else simulated
-
-    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
-    config, later = PlannerConfig(sequences=6, horizon=2), all_push_models.push_models("physics").later
-    policy = search_for_grasp(config, push_model=NativePhysics(threads=5), later_push_model=later)
-
-    def decided(seed):
-        calls.clear()
-        plan = jax.block_until_ready(policy(jax.random.key(seed), problem, *seen(problem)))
-        return plan, np.stack(calls)
-
-    (plan, simulated), again, other = decided(0), decided(0), decided(1)
-    jax.tree.map(np.testing.assert_array_equal, (plan, simulated), again)
-    assert np.isfinite(plan.value)
-    for _, rows in ((plan, simulated), other):
-        # All sequences at once, and as many calls as the one takes that draws most.
-        assert rows[0].all()
-        assert 1 <= len(rows) <= config.draws[0]
-        assert rows.shape[1:] == (6,)
-        assert (rows[1:] <= rows[:-1]).all()
-
-    redraws_fail = True
-    plan, simulated = decided(0)
-    assert len(simulated) == config.draws[0]
-    assert simulated[0].all()
-    # Those that have an action are not simulated again.
-    has_none = int((plan.sequences.actions.kind[:, 0] == ActionKind.NONE).sum())
-    assert 0 < has_none < 6
-    assert simulated[1:].sum(axis=1).tolist() == [has_none] * (config.draws[0] - 1)
-
-
-@pytest.mark.slow
-def test_a_decision_simulates_all_its_pushes_in_the_batch_simulator(problem):
-    problem = pushing(problem)
-    plan, native = (
-        search_for_grasp(push_model=model, sequences=2, horizon=2)(jax.random.key(0), problem, *seen(problem))
-        for model in (MjxPhysics(), NativePhysics())
-    )
-    assert (plan.sequences.actions.kind[:, 0] == native.sequences.actions.kind[:, 0]).all()
-    assert np.isfinite(plan.value)
-    # Of the sequences that follow, the engines' ends differ by millimetres, in which f counts other poses.
-    np.testing.assert_allclose(plan.predicted.position, native.predicted.position, atol=2e-3)
-    np.testing.assert_allclose(plan.predicted_cost, native.predicted_cost, rtol=0.01)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 import json
 
 import jax
@@ -11,32 +10,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.lab.parts.push import repeated
-from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs.pushing import pushes as generator
 from mechsearch_jax.envs.pushing.push_portions import portions
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, from_scenario, superquadrics
-from mechsearch_jax.geometry import footprints, superquadric, transforms
+from mechsearch_jax.geometry import transforms
 from mechsearch_jax.networks.push import PushConfig
-from mechsearch_jax.networks.push_contacts import reach
-from mechsearch_jax.networks.push_geometry import NORMALS, push_start
-from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
-from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask
 from mechsearch_jax.train.push_scores import (
-    PushTruth,
     average_precision,
-    model_scores,
-    no_motion,
     planar_turn,
-    push_truth,
-    turn_error,
 )
 from mechsearch_jax.train.scenes import SceneConfig, random_world
 from mechsearch_jax.workspace.scenario import Body, Scenario
@@ -49,8 +36,6 @@ DRAW_WORLD = functools.partial(random_world, config=SCENES)
 
 
 WORLDS = 8
-VARIED = jax.jit(jax.vmap(training.varied))
-VARIED_MUCH = jax.jit(jax.vmap(training.varied, in_axes=(0, None, None)))
 
 
 def simulated(seed, rounds):
@@ -134,15 +119,6 @@ def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
     assert np.median(gaps) == pytest.approx(0.5 * sum(CONFIG.gap), abs=4e-3)
 
 
-@pytest.mark.slow
-def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
-    (world, action, possible), _ = drawn
-    empty = ~world.valid.any(axis=1)
-    assert empty.sum() > 5
-    assert not possible[empty].any()
-    assert (action.kind[empty] == ActionKind.NONE).all()
-
-
 # --- what becomes of it ----------------------------------------------------------------------------------------------
 
 
@@ -159,47 +135,6 @@ def test_objects_are_displaced_along_the_push(pushes):
     assert (along[upright] < length[upright] + 0.03).all()
     assert (along[upright] > -0.005).all()
     assert np.median((along / np.maximum(length - 0.01, 0.01))[upright]) == pytest.approx(1.0, abs=0.35)
-
-
-@pytest.mark.slow
-def test_the_wrist_that_a_push_was_made_with_is_kept(pushes):
-    assert pushes.q7.shape == (len(pushes.object),)
-    assert np.isin(pushes.q7, push_tables(CONFIG).q7[1]).all()
-    assert len(np.unique(pushes.q7)) > 1
-
-
-@pytest.mark.slow
-def test_objects_that_are_far_from_the_push_stay(pushes):
-    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
-    assert 0.1 < truth.moved[truth.valid].mean() < 0.9
-    middle = pushes.T_world_gripper[:, :3, 3] + 0.5 * pushes.displacement
-    away = np.linalg.norm(pushes.before.position[..., :2] - middle[:, None, :2], axis=-1)
-    # Links of the arm may still strike what is 0.35 m away.
-    far = truth.valid & (away > 0.4)
-    assert far.sum() > 3
-    assert not truth.moved[far].any()
-
-
-@pytest.mark.slow
-def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
-    followed = 0
-    for lane in np.unique(pushes.lane):
-        rows = np.flatnonzero(pushes.lane == lane)
-        for a, b in itertools.pairwise(rows):
-            if np.array_equal(pushes.after.half_size[a], pushes.before.half_size[b]):
-                followed += 1
-                valid = pushes.before.valid[b]
-                np.testing.assert_array_equal(pushes.after.position[a][valid], pushes.before.position[b][valid])
-    assert followed >= 3
-
-
-@pytest.mark.slow
-def test_the_same_key_gives_the_same_pushes(pushes):
-    again, other = simulated(0, 1), simulated(4, 1)
-    first = len(again.object)
-    for a, b in zip(jax.tree.leaves(pushes), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a[:first], b)
-    assert not np.isin(other.displacement[:, 1], again.displacement[:, 1]).any()
 
 
 def upright_world(kind, rotation):
@@ -255,6 +190,7 @@ def test_a_world_is_simulated_as_its_scenario_is():
 # --- what is kept ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pushes_are_made_once_and_read_again(tmp_path):
     generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
     counts = []
@@ -282,12 +218,6 @@ def test_pushes_are_made_once_and_read_again(tmp_path):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("wrong", [{"pushes": 0}, {"worlds": 0}, {"rounds": 0}, {"seed": -1}])
-def test_impossible_generations_are_refused(wrong):
-    with pytest.raises(InputError):
-        Generation(**{"seed": 0, "pushes": 5, "worlds": 8, **wrong})
-
-
 # --- what is learnt and how it is scored -----------------------------------------------------------------------------
 
 
@@ -305,187 +235,6 @@ def test_average_precision_is_the_area_by_hand():
     assert average_precision(score, np.array([1, 0, 1, 0, 0], bool)) == pytest.approx((1 / 1 + 2 / 3) / 2)
     assert average_precision(np.ones(4), np.array([1, 0, 0, 1], bool)) == pytest.approx(0.5)
     assert np.isnan(average_precision(score, np.zeros(5, bool)))
-
-
-def test_a_turn_by_half_a_turn_is_no_error():
-    error = turn_error(jnp.float32([0.1, np.pi, 3.0]), jnp.float32([0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(error, [0.1, 0.0, 3.0 - np.pi], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_the_truth_costs_nothing_but_its_scale(pushes):
-    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
-    sure = jnp.where(truth.moved, 30.0, -30.0)
-    exact = training.PushMotion(
-        shift=truth.shift,
-        turn=truth.turn,
-        moves=sure,
-        topples=jnp.where(truth.toppled, 30.0, -30.0),
-        log_scale=jnp.zeros((*truth.turn.shape, 2)),
-    )
-    terms = training.example_loss(exact, truth)
-    assert max(float(terms[name]) for name in ("shift", "turn", "moves", "topples")) < 2e-3
-    wrong = exact.replace(shift=truth.shift + jnp.array([0.03, 0.04])[None, None], moves=-sure)
-    terms = training.example_loss(wrong, truth)
-    assert terms["shift"] == pytest.approx(5.0, rel=1e-3)
-    assert terms["moves"] > 10
-
-
-@pytest.mark.slow
-def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
-    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
-    start, truth = task.start(on_device), push_truth(on_device)
-    count = len(pushes.object)
-    varied, kept = VARIED(jax.random.split(jax.random.key(0), count), start, truth)
-    np.testing.assert_array_equal(varied.prints.valid, kept.valid)
-    left_out = np.asarray(truth.valid & ~kept.valid)
-    assert left_out.sum() > 5
-    assert not np.any(left_out & np.asarray(truth.moved))
-    # Without them, the same comes of the push, but for what a nudge would change too.
-    shortened = np.flatnonzero(left_out.any(axis=1))
-    fewer = jax.tree.map(lambda a: a[shortened], pushes)
-    fewer = fewer.replace(before=fewer.before.replace(valid=np.asarray(kept.valid)[shortened]))
-    there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[shortened]
-
-    def agreement(again):
-        outcome = repeated(again, NativeSimulator(2, generator.push_simulation()), WORLDS)
-        gap = np.linalg.norm((outcome.scene.position - pushes.after.position[shortened])[..., :2], axis=-1)[there]
-        return np.median(gap), np.mean(gap < 5e-3)
-
-    # That begins at rest, too, where the bodies still moved a little.
-    baseline = agreement(jax.tree.map(lambda a: a[shortened], pushes))
-    median, close = agreement(fewer)
-    assert median < baseline[0] + 5e-4
-    assert close > baseline[1] - 0.15
-
-
-@pytest.mark.slow
-def test_poses_are_blurred_and_nothing_else(pushes):
-    start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
-    start = jax.tree.map(lambda a: a[0], start)
-    keys = jax.random.split(jax.random.key(3), 2000)
-    blurred = jax.vmap(training.blurred, in_axes=(0, None, None))(keys, start, 1e-3)
-    off = np.asarray(blurred.prints.position - start.prints.position[None])
-    turn = np.asarray(blurred.prints.yaw - start.prints.yaw[None])
-    np.testing.assert_allclose(off.std(axis=0), 1e-3, rtol=0.1)
-    np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=1.5e-4)
-    np.testing.assert_allclose(turn.std(axis=0), 1e-3 / 0.08, rtol=0.1)
-    assert abs(np.corrcoef(off[:, 0, 0], turn[:, 0])[0, 1]) < 0.1
-    same = blurred.replace(prints=blurred.prints.replace(position=start.prints.position, yaw=start.prints.yaw))
-    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(start), strict=True):
-        np.testing.assert_array_equal(np.broadcast_to(a, np.shape(a)), np.broadcast_to(b, np.shape(a)))
-    exactly = training.blurred(keys[0], start, 0.0)
-    np.testing.assert_array_equal(exactly.prints.position, start.prints.position)
-
-
-@pytest.mark.slow
-def test_what_is_sampled_to_learn_from_is_blurred(pushes):
-    def sampled(blur):
-        task = dataclasses.replace(task_of(pushes), blur=blur)
-        return jax.jit(lambda key: task.sample(key, 32))(jax.random.key(0))
-
-    assert task_of(pushes).blur > 0
-    sharp, soft = sampled(0.0), sampled(1e-3)
-    for a, b in zip(jax.tree.leaves(sharp.truth), jax.tree.leaves(soft.truth), strict=True):
-        np.testing.assert_array_equal(a, b)
-    off = np.asarray(soft.start.prints.position - sharp.start.prints.position)
-    assert 8e-4 < off.std() < 1.2e-3
-
-
-def row_of_boxes(*gaps):
-    """A push of the first of several boxes in a row along y, which moves by 5 cm; nothing becomes of the others.
-
-    There are four slots, so that rows of any length are compiled once.
-    """
-    half = np.float32([0.03, 0.03, 0.05])
-    y = np.cumsum([-0.1, *(gap + 0.06 for gap in gaps)])
-    count = len(y)
-    position = np.stack([np.full(count, 0.6), y, np.full(count, SHELF.board + half[2])], axis=1)
-    scene = superquadric.Superquadrics(
-        size=jnp.asarray(np.tile(half, (count, 1))),
-        exponents=jnp.full((count, 2), 0.2),
-        position=jnp.float32(position),
-        rotation=jnp.broadcast_to(jnp.eye(3), (count, 3, 3)),
-        valid=jnp.ones(count, bool),
-    )
-    T = transforms.make(
-        gripper_rotation(jnp.float32(0.0), jnp.float32(0.5)), jnp.float32([0.6, -0.17, SHELF.board + 0.05])
-    )
-    scene = superquadric.pad(scene, 4)
-    start = push_start(SHELF, scene, push_tables(CONFIG).pusher, T, jnp.float32([0.0, 0.05, 0.0]))
-    moved = jnp.arange(4) == 0
-    shift = jnp.where(moved[:, None], jnp.float32([[0.0, 0.05]]), 0.0)
-    none = jnp.zeros(4)
-    return start, PushTruth(shift, none, moved, none > 0, scene.valid)
-
-
-@pytest.mark.parametrize(
-    # Between circles around the boxes there are 25 mm less than between their sides.
-    ("gaps", "kept"),
-    [((0.2,), [True, False]), ((0.06, 0.02, 0.2), [True, True, True, False])],
-)
-def test_what_may_have_held_something_in_place_is_never_left_out(gaps, kept):
-    start, truth = row_of_boxes(*gaps)
-    keys = jax.random.split(jax.random.key(0), 64)
-    _, left = VARIED_MUCH(keys, start, truth)
-    there = left.valid[:, : len(kept)]
-    np.testing.assert_array_equal(there.all(axis=0), kept)
-    assert there.any(axis=0).all()
-
-
-@pytest.mark.slow
-def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
-    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
-    start, truth = task.start(on_device), push_truth(on_device)
-    count = len(pushes.object)
-    varied, kept = VARIED(jax.random.split(jax.random.key(1), count), start, truth)
-    moved = np.asarray(varied.faces - start.faces)
-    assert (moved > 0).any()
-    assert (moved < 0).any()
-    for push, wall in zip(*np.nonzero(moved), strict=True):
-        valid = np.asarray(kept.valid)[push]
-        assert not np.asarray(truth.toppled)[push][valid].any()
-        normal, face = NORMALS[wall], np.asarray(varied.faces)[push, wall]
-        for world in (pushes.before, pushes.after):
-            prints = footprints.footprints(superquadrics(jax.tree.map(lambda a, push=push: a[push], world)))
-            toward = reach(prints, jnp.broadcast_to(-jnp.asarray(normal)[None], prints.position.shape))
-            inside = np.asarray(prints.position) @ normal - np.asarray(toward) - face
-            # Those that lean end with other footprints than they began with.
-            assert (inside[valid & (np.asarray(start.tilt)[push] < 1e-3)] > 0).all()
-        if normal[0] <= 0:
-            hand = np.asarray(start.points)[push, :, :2]
-            assert (np.stack([hand, hand + np.asarray(start.displacement)[push]]) @ normal > face).all()
-
-
-@pytest.mark.slow
-def test_a_model_that_knows_the_outcome_scores_best(pushes):
-    after = pushes.after
-
-    # The model recognises a push by where the gripper starts.
-    def oracle(shelf, scene, pusher, T, displacement, q7):
-        row = jnp.argmin(jnp.sum((jnp.asarray(pushes.T_world_gripper)[:, :3, 3] - T[None, :3, 3]) ** 2, axis=1))
-        exact = scene.replace(
-            position=jnp.asarray(after.position)[row],
-            rotation=jnp.asarray(after.rotation)[row],
-        )
-        over = jnp.asarray(pushes.toppled)[row].astype(jnp.float32)
-        return push_model.PushOutcome(exact, exact.valid, jnp.zeros(()), jnp.array(True), over)
-
-    pusher = push_tables(CONFIG).pusher
-    best = model_scores(oracle, pushes, pusher, batch=8)["all"]
-    assert best["pushes"] == len(pushes.object)
-    assert best["pushed_mm"] < 1e-3
-    assert best["pushed_deg"] < 0.05
-    assert best["still"] == 1.0
-    assert best["topple_ap"] in (None, 1.0)
-    idle = model_scores(no_motion, pushes, pusher, batch=8)["all"]
-    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
-    rows = np.arange(len(pushes.object))
-    upright = ~truth.toppled[rows, pushes.object]
-    assert best["pushed_toppled"] == (~upright).sum()
-    assert best["toppled"] == (np.asarray(truth.toppled) & truth.valid).sum()
-    moved = np.linalg.norm(np.asarray(truth.shift)[rows, pushes.object], axis=1)[upright]
-    assert idle["pushed_mm"] == pytest.approx(1e3 * moved.mean(), abs=2e-3)
 
 
 def task_of(pushes: Pushes) -> PushTask:

@@ -1,7 +1,5 @@
 """The planner's eyes: what recognisers make of the simulated world."""
 
-import colorsys
-import dataclasses
 import types
 
 import jax
@@ -11,18 +9,15 @@ import pytest
 
 from mechsearch_jax.benchmarks.lab.parts.segmentation import numbered
 from mechsearch_jax.envs.camera import recognisers
-from mechsearch_jax.envs.camera.colour_image import drawn_appearance, scene_key
 from mechsearch_jax.envs.camera.recognisers import recogniser, true_labels
-from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
-from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, nearest_bodies, oracle
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.snapshot import Snapshot, nearest_bodies
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view, thinned_view
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
-from mechsearch_jax.images.noise import measured_depth
 from mechsearch_jax.perception.recogniser import Recogniser, labelled, large_segments
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.camera import Camera, back_project
@@ -162,15 +157,6 @@ def test_full_finds_the_target_in_colour_where_it_is_in_sight(world, shown, y, i
         assert np.sum(named & ~true) < 0.05 * np.sum(true)
 
 
-@pytest.mark.slow
-def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(world, shown):
-    image, owner, _ = shown(world)
-    nothing = owner == -1
-    assert nothing.sum() > 1000
-    assert np.isnan(image.depth[nothing]).all()
-    assert np.isfinite(image.depth[~nothing]).all()
-
-
 @pytest.mark.parametrize("name", ["masks", "full"])
 def test_what_sees_images_reads_nothing_else_of_the_truth(world, name):
     """A snapshot that refuses to give the truth does not differ."""
@@ -219,48 +205,6 @@ def test_a_robot_with_the_same_images_recognises_the_same(world, masks, seen):
     depth, mask = whole(np.asarray(images.depth), np.nan), whole(np.asarray(images.mask), OTHER)
     again = robot(jax.random.key(7), depth, mask=mask, target_id=int(images.target_id))
     jax.tree.map(np.testing.assert_array_equal, again, seen)
-
-
-def test_colours_belong_to_the_scene_and_keep_away_from_the_targets(world):
-    key = scene_key(world)
-    assert (jax.random.key_data(key) == jax.random.key_data(scene_key(moved(world, 0, [0.5, 0.1, 0.5])))).all()
-    taller = world.replace(half_size=world.half_size.at[0, 2].add(0.001))
-    assert (jax.random.key_data(key) != jax.random.key_data(scene_key(taller))).any()
-    target = (0.1, 0.3, 0.8)
-    middle = colorsys.rgb_to_hsv(*target)[0]
-    least = {}
-    for gap in (0.0, 40.0, 120.0):
-        apart = []
-        for seed in range(20):
-            colours = np.asarray(drawn_appearance(jax.random.key(seed), target, gap).colours)
-            assert colours.shape == PALETTE.shape
-            assert colours.min() >= 0.0
-            assert colours.max() <= 1.0
-            np.testing.assert_allclose(colours[TARGET], target, rtol=1e-6)
-            hues = np.array([colorsys.rgb_to_hsv(*rgb)[0] for rgb in colours[:TARGET]])
-            apart += list(180 - np.abs(np.mod(360 * np.abs(hues - middle), 360) - 180))
-        least[gap] = min(apart)
-        assert min(apart) > gap - 0.1
-    assert least[0.0] < 10
-
-
-def test_depth_is_infinite_where_nothing_is_and_nan_where_nothing_was_measured():
-    camera = dataclasses.replace(CAMERA, width=3, height=1)
-    depth = jnp.float32([[0.8, jnp.inf, 0.9]])
-    points = back_project(camera, depth).at[0, 2].set(jnp.nan)
-    measured = np.asarray(measured_depth(camera, depth, points))
-    np.testing.assert_allclose(measured[0, 0], 0.8, atol=1e-6)
-    assert np.isinf(measured[0, 1])
-    assert np.isnan(measured[0, 2])
-
-
-def test_names_stand_for_one_object_each(masks):
-    target = target_of(SCENE)
-    assert recogniser("masks", target) is masks
-    assert recogniser("oracle", target) is oracle
-    assert recogniser("informed", target) is informed
-    with pytest.raises(InputError, match="unknown; use oracle, masks, masks-parts, full, full-parts, informed"):
-        recogniser("eyes", target)
 
 
 @pytest.mark.slow

@@ -10,13 +10,12 @@ from stage import stays_put
 
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.scenes import scene_sets
-from mechsearch_jax.envs.scenes.generator import GeneratorConfig, outline, separation
-from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
-from mechsearch_jax.envs.scenes.three_objects import LineConfig, LineGenerator
+from mechsearch_jax.envs.scenes.generator import outline, separation
+from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, make_scene, recorded, scene_files
+from mechsearch_jax.envs.scenes.three_objects import LineConfig
 from mechsearch_jax.envs.world import world
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime import kept_arrays
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 
@@ -142,28 +141,6 @@ def test_two_cylinders_in_line_hide_the_target_each_by_itself():
     assert np.ptp(sizes, axis=0) == pytest.approx([0.01, 0.045], rel=0.4)
 
 
-def test_what_cannot_be_in_line_is_one_line():
-    with pytest.raises(InputError, match="seed: -1 is negative"):
-        LineGenerator().generate(-1)
-    thin = LineGenerator(LineConfig(radius=(0.005, 0.006), attempts=5), GeneratorConfig(visible=100))
-    with pytest.raises(InputError, match="mine: no scene fits in 5 attempts"):
-        thin.generate(0, "mine")
-
-
-def test_names_of_scenes():
-    block, index = find_scene("c2-4-017")
-    assert (block.name, index, block.scene_name(index)) == ("c2-4", 17, "c2-4-017")
-    assert find_scene("d1-199") == (SETS["d1"].blocks[0], 199)
-    for none in ("d1-200", "c2-017", "c2-4-17", "c2-4", "c2-5-000", "first-light", ""):
-        assert find_scene(none) is None, none
-    assert find_set("d3-4").blocks == (SETS["d3"].blocks[0],)
-    with pytest.raises(InputError, match="c9: there is no such scene set; there are c2, c2-2, "):
-        find_set("c9")
-    for index in (-1, 180):
-        with pytest.raises(InputError, match=f"c2-4: there is no scene {index}; there are 180"):
-            make_scene(block, index)
-
-
 @pytest.fixture
 def quick(monkeypatch):
     """A block whose scenes cost nothing, and the numbers of those that were made."""
@@ -209,36 +186,9 @@ def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, q
     assert scene_files([(block, 1)], tmp_path / "mine").files == [tmp_path / "mine" / "quick-001.json"]
 
 
-def test_several_processes_make_the_scenes_on_record_in_order(tmp_path, monkeypatch):
-    monkeypatch.setattr(scene_sets, "EACH", 1)
-    monkeypatch.setattr(scene_sets, "cores", lambda: 2)
-    block = find_set("c2").blocks[0]
-    made = scene_files([(block, 2), (block, 0), (block, 1)], tmp_path)
-    assert [file.name for file in made.files] == [f"{block.scene_name(i)}.json" for i in (2, 0, 1)]
-    assert [load_scenario(file).content_hash for file in made.files] == [recorded()[block.name][i] for i in (2, 0, 1)]
-
-
 def test_scenes_that_are_not_what_is_on_record_are_reported(tmp_path, quick):
     block, _, record = quick
     record[1] = "0123456789ab"
     files = scene_files([(block, i) for i in range(4)], tmp_path)
     assert files.strange == ["quick-001"]
     assert len(files.files) == 4
-
-
-def test_without_a_cache_files_are_there_while_the_process_is(monkeypatch, quick):
-    block, made, _ = quick
-    monkeypatch.setenv(kept_arrays.VARIABLE, "")
-    (file,) = scene_files([(block, 3)]).files
-    assert load_scenario(file).name == "quick-003"
-    assert scene_files([(block, 3)]).files == [file]
-    assert made == [3]
-
-
-def test_a_record_is_written_and_read(tmp_path, monkeypatch):
-    block = dataclasses.replace(SETS["d1"].blocks[0], scenes=2)
-    monkeypatch.setattr(scene_sets, "_EXPERIMENTS", (SETS["d1"]._replace(blocks=(block,)),))
-    monkeypatch.setattr(scene_sets, "_BLOCKS", {"d1": block})
-    scene_sets.record(path=tmp_path / "record.json")
-    monkeypatch.setattr(scene_sets, "RECORD", tmp_path / "record.json")
-    assert scene_sets.recorded.__wrapped__() == {"d1": recorded()["d1"][:2]}

@@ -11,17 +11,12 @@ from stage import OPEN
 
 from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.sensing import sensing_of
-from mechsearch_jax.envs.camera.sensors import EDGE, HAND_DEPTH, SENSORS, Sensor, Surfaces, surfaces_of
-from mechsearch_jax.envs.camera.simulated_camera import SHELF as BOARD
-from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.sensors import EDGE, SENSORS, Sensor, Surfaces
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode.episodes import target_of
-from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch, SensorName
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.images.cloud import shelf_view, view
 from mechsearch_jax.images.noise import RandomDirection, depth_of, no_noise
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -115,14 +110,6 @@ def test_mixed_pixels_lie_between_both_depths_at_edges_alone():
     assert not changed.any()
 
 
-def test_a_hand_is_in_the_lower_part_of_its_share_of_the_images():
-    below = dataclasses.replace(CAMERA, cy=-200.0)
-    depth = jax.jit(jax.vmap(lambda key: depth_of(below, Sensor(arm=0.5)(key, below, wall(0.8)))))
-    seen = np.asarray(depth(jax.random.split(jax.random.key(1), 200))) < HAND_DEPTH + 0.01
-    assert seen.any(axis=(1, 2)).mean() == pytest.approx(0.25, abs=0.15)
-    assert not seen[:, 0].any()
-
-
 def test_eager_jitted_and_in_a_batch_the_same_and_a_sweep_traces_once():
     before = one._cache_size()
     for sensor in SENSORS.values():
@@ -131,66 +118,6 @@ def test_eager_jitted_and_in_a_batch_the_same_and_a_sweep_traces_once():
     assert one._cache_size() == max(before, 1)
     eager = depth_of(CAMERA, sensor(KEYS[1], CAMERA, step(), MATT))
     np.testing.assert_allclose(eager, jitted, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["structured-light", "active-stereo"])
-def test_a_thinned_image_has_the_noise_of_the_full_one(name):
-    sensor = SENSORS[name].replace(jitter=0.0, step=0.0, missing=0.0, arm=0.0)
-    thin = view(CAMERA, (0, SIZE[0]), (0, SIZE[1]), 2)
-    full = depth_of(CAMERA, sensor(KEYS[2], CAMERA, step()))
-    seen = np.asarray(depth_of(thin.camera, sensor(KEYS[2], thin.camera, thin.of(step()))))
-    far = np.ones(seen.shape, bool)
-    far[15:65, 25:65] = False
-    # Rays of which a hole's edge is decided by rounding are few.
-    assert np.mean(np.abs(np.asarray(thin.of(full)) - seen)[far] > 1e-5) < 0.01
-    lost = [np.isnan(image[20:60]).mean() for image in (np.asarray(thin.of(full)), seen)]
-    assert lost[0] == pytest.approx(lost[1], rel=0.3)
-
-
-def test_a_shiny_board_shows_what_stands_on_it_below_it():
-    world, shelf = from_scenario(OPEN), Shelf()
-    camera = shelf_view(Camera(), shelf, stride=4).camera
-    image = observe(camera, world, shelf)
-    surfaces = surfaces_of(jax.random.key(0), camera, shelf, world, image.segmentation, image.depth)
-    material = jnp.where(image.segmentation == BOARD, 1.0, 0.0)
-    points = np.asarray(
-        Sensor(poor_shelf=0.5, mirror=0.02)(jax.random.key(0), camera, image.depth, surfaces.replace(material=material))
-    )
-    below = points[points[..., 2] < shelf.board - 1e-3]
-    below = below[below[:, 0] > shelf.front + 1e-3]
-    assert len(below) > 20
-    assert 0.01 < shelf.board - below[:, 2].min() < 0.0201
-    # Turned up they lie on a body: in its bounding box, most of them on a face of that.
-    upper = below * [1, 1, -1] + [0, 0, 2 * shelf.board]
-    valid = np.asarray(world.valid)
-    R, centre = np.asarray(world.rotation)[valid], np.asarray(world.position)[valid]
-    local = np.abs(np.einsum("bji,nbj->nbi", R, upper[:, None] - centre[None]))
-    outside = np.min(np.max(local - np.asarray(world.half_size)[valid][None], axis=-1), axis=1)
-    assert outside.max() < 1e-5
-    assert np.median(np.abs(outside)) < 1e-5
-    assert len(np.unique(np.asarray(surfaces.material))) > 1
-
-
-def test_colours_are_off_by_pixels():
-    colour = jnp.zeros((4, 20, 3)).at[:, 10].set(1.0)
-    shifted = np.asarray(Sensor(colour_shift=2.0).shifted(CAMERA, colour))
-    assert np.argmax(shifted[0, :, 0]) == 12
-    half = dataclasses.replace(CAMERA, fx=CAMERA.fx / 4)
-    np.testing.assert_allclose(Sensor(colour_shift=2.0).shifted(half, colour)[0, 9:13, 0], [0, 0.5, 0.5, 0])
-
-
-def test_a_sensor_is_a_part_of_the_world_and_of_rows():
-    method = Method(recognition="masks", mismatch=Mismatch(sensor="active-stereo"))
-    assert method.options()["mismatch.sensor"] == "active-stereo"
-    assert Method.of_options(method.options()) == method
-    keys = {Mismatch(sensor=name).compile_key() for name in get_args(SensorName) if name != "ideal"}
-    assert keys == {Mismatch(missing_depth=0.1).compile_key()}
-    with pytest.raises(InputError, match='sensor "radar" is unknown; use ideal, structured-light'):
-        Mismatch(sensor="radar")
-    with pytest.raises(InputError, match="depth_noise is of sensor ideal"):
-        Mismatch(sensor="time-of-flight", depth_noise=0.002)
-    with pytest.raises(InputError, match="need an image"):
-        Method(mismatch=Mismatch(sensor="time-of-flight")).check()
 
 
 def test_the_simulated_camera_takes_images_by_the_sensor():

@@ -7,8 +7,8 @@ import pytest
 from stage import HIDDEN, OPEN
 
 from mechsearch_jax.envs.camera.simulated_camera import observe
-from mechsearch_jax.envs.cell.simulated_cell import SHELF, SensorNoise, SimulatedCell, _owner
-from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.envs.cell.simulated_cell import SensorNoise, SimulatedCell
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import Bounds, RobotTrajectory
@@ -67,10 +67,6 @@ def test_noise_is_as_large_as_it_says_and_missing_pixels_are_0():
 def test_the_target_is_counted_where_it_is_seen():
     assert SimulatedCell(CELL, HIDDEN, noise=EXACT).target_pixels() == 0
     assert SimulatedCell(CELL, OPEN, noise=EXACT).target_pixels() > 20
-
-
-def test_every_geometry_has_an_owner():
-    assert [_owner(name) for name in ("box3", "cylinder8", "board_box", "")] == [3, TARGET, SHELF, SHELF + 1]
 
 
 def test_the_arm_follows_a_trajectory_and_says_where_it_is():
@@ -147,8 +143,3 @@ def test_what_is_gripped_is_pressed_with_the_given_force():
     ahead = cell._control(still.position[0], 0.0, 60.0)
     assert ahead[-2:].tolist() == pytest.approx([-0.06, -0.06])
     assert cell._control(still.position[0], 0.08)[-2:].tolist() == pytest.approx([0.04, 0.04])
-
-
-def test_impossible_noise_is_refused():
-    with pytest.raises(InputError, match="missing a share below 1"):
-        SensorNoise(missing=1.0)

@@ -5,21 +5,19 @@ import math
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.actions import KINDS, Action, ActionKind, kind_of, no_action, retrieve_action
+from mechsearch_jax.actions import Action, ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.simulators import simulator
-from mechsearch_jax.envs.simulators.native import NativeSimulator, NativeWorld
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.robot import motion
 from mechsearch_jax.robot.arm_config import ARMS, PANDA
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import arm_hits_shelf
@@ -29,7 +27,6 @@ from mechsearch_jax.robot.kinematics import (
     gripper_pose,
     line_kinematics,
 )
-from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
@@ -247,13 +244,6 @@ def test_a_hand_that_closes_on_nothing_reports_a_drop(sim):
     assert np.abs(moved(sim, before)).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["tracking_bound", "settle_steps", "slip"])
-@pytest.mark.parametrize("value", [0, -1.0, math.nan])
-def test_settings_that_make_no_sense_are_refused(name, value):
-    with pytest.raises(InputError, match=f"SimulatorConfig: {name} .* must be a positive number"):
-        simulator.SimulatorConfig(**{name: value})
-
-
 def test_a_body_that_never_comes_to_rest_is_reported():
     """In 0.2 s it has not fallen from 10 cm above the board; in 6 s it has."""
     high = dataclasses.replace(TARGET_BODY, position=(0.6, 0.1, BOARD + 0.15))
@@ -277,42 +267,6 @@ def test_what_is_out_of_reach_moves_nothing(sim):
     retrieval = sim.execute(take_out(far, math.pi / 4))
     assert retrieval.reason() == "unreachable"
     assert not retrieval.retrieved
-
-
-def test_an_unknown_kind_of_action_is_refused(sim):
-    before = sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.6, 0.1)))
-    with pytest.raises(InputError, match="kind 7 is unknown"):
-        sim.execute(no_action().replace(kind=jnp.int32(7)))
-    np.testing.assert_array_equal(sim.world.position, before.position)
-
-
-def test_a_new_kind_of_action_needs_no_simulator(sim, monkeypatch):
-    """Registered under another number, a push is still one."""
-    nudge = dataclasses.replace(KINDS[ActionKind.PUSH], code=7, name="nudge")
-    monkeypatch.setitem(KINDS, 7, nudge)
-    action = push(pose(0.595, 0.1 - 0.1375, 0.04, tilt=math.radians(30)), (0.0, 0.1, 0.0))
-    ends = []
-    for kind in (ActionKind.PUSH, 7):
-        before = sim.reset(scene(standing("box", (0.054, 0.025, 0.054), 0.55, 0.1)))
-        assert sim.execute(action.replace(kind=jnp.int32(kind))).reason() is None
-        ends.append(np.asarray(sim.world.position))
-    assert np.abs(ends[0] - np.asarray(before.position)).max() > 0.05
-    np.testing.assert_array_equal(*ends)
-
-
-def test_worlds_that_were_never_reset_are_refused():
-    worlds = NativeSimulator(threads=1)
-    for call in (lambda: worlds.replace({}), worlds.settle):
-        with pytest.raises(InputError, match="reset it before use"):
-            call()
-
-
-def test_no_action_does_nothing(sim):
-    before = sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.6, 0.1)))
-    outcome = sim.execute(no_action())
-    assert outcome.reason() is None
-    assert outcome.steps == 0
-    np.testing.assert_array_equal(sim.world.position, before.position)
 
 
 def test_an_object_that_leaves_the_board_has_fallen(sim):
@@ -435,37 +389,6 @@ def test_the_arm_follows_its_reference(sim):
     error = np.minimum(np.linalg.norm(reached - wanted, axis=1), np.linalg.norm(reached - ahead, axis=1))
     assert reachable
     assert error.max() < 1e-3
-
-
-@pytest.mark.slow
-def test_references_are_fixed_in_length_and_continuous():
-    plan = MotionConfig()
-    grasps = jnp.stack([pose(0.6, 0.1, 0.1), pose(0.65, 0.0, 0.08, 0.2), pose(0.5, 0.1, 0.12, -0.1)])
-    places = jnp.stack([pose(0.55, 0.2, 0.1), pose(0.6, 0.1, 0.08, 0.2), pose(0.55, 0.1, 0.12, 0.3)])
-    q7, opening = jnp.full(3, WRISTS[0], jnp.float32), jnp.full(3, 0.08)
-    build = jax.jit(jax.vmap(lambda *a: motion.pick_and_place_reference(*a, plan)))
-    batch, reachable = build(grasps, places, q7, opening)
-    assert reachable.all()
-    assert (batch.q.shape[1] > batch.length).all()
-    assert (batch.length > batch.opens).all()
-    alone = jax.jit(motion.pick_and_place_reference, static_argnums=4)
-    for i in range(3):
-        single, _ = alone(grasps[i], places[i], q7[i], opening[i], plan)
-        np.testing.assert_allclose(batch.q[i], single.q, atol=1e-5)
-        np.testing.assert_allclose(batch.fingers[i], single.fingers, atol=1e-6)
-    assert float(jnp.abs(batch.velocity).max()) * plan.timestep < 0.03
-    np.testing.assert_allclose(batch.q[:, 0], batch.start[:, :7], atol=0.01)
-    closed = simulator.controls(jax.tree.map(lambda a: a[0], batch))
-    assert closed.shape == (int(batch.length[0]), 9)
-
-
-def test_a_motion_config_that_makes_no_sense_is_refused():
-    with pytest.raises(InputError, match="must be positive"):
-        MotionConfig(timestep=0.0)
-    with pytest.raises(InputError, match="at least 2 waypoints"):
-        MotionConfig(waypoints=1)
-    with pytest.raises(InputError, match=r"carry_pace 1\.5 must be"):
-        MotionConfig(carry_pace=1.5)
 
 
 def test_home_is_clear_of_the_shelf():

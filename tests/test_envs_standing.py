@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import jax
 import numpy as np
 import pytest
 from published import published_scenarios
@@ -11,8 +10,6 @@ from published import published_scenarios
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.scenes.standing import check_standing, faults
 from mechsearch_jax.envs.simulators.native import NativeWorld
-from mechsearch_jax.envs.world.touching import unrest
-from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario, save_scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -139,27 +136,3 @@ def test_what_leans_comes_to_rest(world, tilt, shape):
         assert not np.asarray(outcome.restless).any()
         world.settle()
         assert world.trace.time[-1] < 0.5
-
-
-@pytest.mark.parametrize(
-    ("bodies", "expected"),
-    [
-        ((against_the_back(0.5),), "object 0 leans on the back wall"),
-        ((lying(math.pi / 2, 0.6, 0.1),), "object 0 rolls on the board"),
-        ((dataclasses.replace(TARGET, position=(0.6, 0.1, BOARD + 0.05)),), "object 0 slides on the board"),
-        ((dataclasses.replace(TARGET, position=(0.6, 0.1, BOARD + 0.1)),), "object 0 falls"),
-        (
-            (
-                lying(0.5, 0.56, 0.1, shape="box"),
-                Body("box", (0.05, 0.06, 0.08), (0.56 + deep(0.5) + 0.05, 0.1, BOARD + 0.08), (1.0, 0.0, 0.0, 0.0)),
-            ),
-            "object 0 leans on object 1",
-        ),
-    ],
-)
-def test_what_moves_on_is_said_as_a_person_sees_it(bodies, expected):
-    world = jax.tree.map(lambda leaf: leaf[None], from_scenario(Scenario("moves", bodies, TARGET)))
-    restless = np.arange(9) == 0
-    (text,) = unrest(world, restless, SHELF, 0)
-    assert text == expected
-    assert unrest(world, np.zeros(9, bool), SHELF, 0) == ()

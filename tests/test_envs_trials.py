@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
-from test_envs_simulator import take_out as retrieval
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
@@ -21,7 +20,6 @@ from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.attempt import TrialScene
-from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.nearby import Perturbations
 from mechsearch_jax.envs.trials.order import in_order
@@ -29,7 +27,7 @@ from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.grasping.retrieval import ALIKE, ALIKE_WRIST, best_grasp, top_grasps
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
+from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.step import DRAWS, SearchState, decide
 from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, scenes_of
@@ -471,16 +469,6 @@ def test_what_becomes_of_a_simulation_that_diverges_is_not_known(problem):
     np.testing.assert_array_equal(world._data.qpos, before)
 
 
-def test_the_hand_of_the_problem_is_the_one_that_is_tried(problem, monkeypatch):
-    seen, at = objects_and_pose(problem, EDGE)
-    heard = []
-    monkeypatch.setattr(native, "reference_motion", lambda kind, action, config: heard.append(config.gripper))
-    other = problem.replace(gripper=dataclasses.replace(problem.gripper, approach=0.09))
-    for here in (problem, other):
-        assert results_of(MODEL, here, seen, at, False, stack(pushes()[2])).tolist() == [FAILED]
-    assert heard == [problem.gripper, other.gripper]
-
-
 def several(*scenes):
     """Scenes with hidden targets as `Trials` take them."""
     seen = stack(*scenes)
@@ -604,29 +592,6 @@ def test_what_is_worth_trying_in_all_slots_is_tried_together(problem):
     assert slots.decide(keys, []) == {}
 
 
-@pytest.mark.slow
-def test_slots_whose_target_is_not_taken_out_plan(problem):
-    _, _, aside = pushes()
-    calls = []
-
-    def trials(problem, scenes, actions, wanted):
-        calls.append(sorted({int(kind) for kind in actions.kind[wanted]}))
-        return MODEL(problem, scenes, actions, wanted)
-
-    rows = [(LOOSE, True), (EDGE, False), (FIRM, True), (OPEN, True)]
-    slots, keys = slots_of(problem, proposes(aside), trials, rows)
-    choices = slots.decide(keys, [0, 1, 2, 3])
-    kinds = [int(choices[row].action.kind) for row in range(4)]
-    assert [kind == ActionKind.RETRIEVE for kind in kinds] == [True, False, False, True]
-    # Plans for a found target and for a hidden one are programs of their own.
-    assert calls == [[ActionKind.RETRIEVE], [ActionKind.PUSH], [ActionKind.PUSH]]
-    for row, (objects, found) in enumerate(rows):
-        belief, observation = look(problem, objects, found)
-        alone = decided(proposes(aside), MODEL, keys[row], problem, belief, observation)
-        assert int(alone.action.kind) == kinds[row]
-        np.testing.assert_allclose(alone.action.T_world_gripper, choices[row].action.T_world_gripper, atol=1e-6)
-
-
 @pytest.mark.parametrize("threads", [1, 3, 16])
 def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(threads):
     made, tried = [], []
@@ -687,15 +652,3 @@ def test_what_is_not_touched_sleeps(problem):
     scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world_of(problem, EDGE)))
     # The arm alone is awake, before anything is touched.
     assert (scene._data.tree_asleep >= 0).tolist() == [False] + [True] * 9
-
-
-def test_names():
-    assert named_trials("none") is None
-    assert named_trials("physics") is named_trials("physics")
-    assert named_trials("physics") == MODEL
-    for refuse in (named_trials, lambda name: dataclasses.replace(Config(), trials=name)):
-        with pytest.raises(InputError, match='trials "guess" is unknown; use none, physics'):
-            refuse("guess")
-    # What is tried out is simulated as it is executed.
-    assert MODEL.simulation == NativeWorld().config
-    assert retrieval(pose(0.6, 0.0, 0.05)).kind == ActionKind.RETRIEVE

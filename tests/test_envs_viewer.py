@@ -2,7 +2,6 @@
 
 import shutil
 import socket
-import sys
 import threading
 
 import numpy as np
@@ -11,16 +10,8 @@ from browser import page, wait_for
 from recordings import LOST, MOVES, OBJECTS, RECORDING, SAMPLED, WORLD
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.recording.recording import NAME, save_recording
-from mechsearch_jax.envs.recording.step_values import Ending
-from mechsearch_jax.envs.viewer.shown import card, shown_steps
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.robot.arm_clearance import link_poses
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import Capsule
-from mechsearch_jax.viz import drawing, web
-from mechsearch_jax.viz.panda import panda_pieces, panda_solids
+from mechsearch_jax.viz import drawing
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FPS = 10
@@ -122,34 +113,6 @@ def test_a_sampled_action_shows_what_was_predicted_of_it(viewer, server):
     assert worst[0] > best[0]
 
 
-def test_numbers_stand_on_the_objects_and_go_with_them(viewer, server):
-    viewer.show(0)
-    number, box = node(server, "/numbers/0"), node(server, "/true/0")
-    height = 2 * float(WORLD.half_size[0, 2])
-    np.testing.assert_allclose(number.position - box.position, [0.0, 0.0, height / 2], atol=1e-6)
-    assert (number.text, number.visible, node(server, "/numbers/1").visible) == ("0", True, False)
-    viewer.show(first_row(viewer, 1) - 1)
-    np.testing.assert_allclose(number.position - box.position, [0.0, 0.0, height / 2], atol=1e-6)
-    assert node(server, "/true/0").position[1] > WORLD.position[0, 1] + 0.09
-
-
-def test_the_map_is_shown_from_above_and_lies_open_in_the_window(viewer, server):
-    viewer.show(0)
-    maps = [shown.above for shown in shown_steps(RECORDING)]
-    np.testing.assert_array_equal(viewer.pictures["above"], maps[0])
-    viewer.show(first_row(viewer, 2))
-    np.testing.assert_array_equal(viewer.pictures["above"], maps[2])
-    assert (maps[0] != maps[2]).any()
-    # From where the page begins most of the cells are seen beside the box, which is as high as they are far behind it.
-    camera = server.initial_camera
-    cells = np.asarray(node(server, "/map/0/cells").batched_positions)
-    rays = cells - np.asarray(camera.position)
-    box = np.asarray(WORLD.position[0]), np.asarray(WORLD.half_size[0])
-    near, far = ((box[0] + side * box[1] - camera.position) / rays for side in (-1, 1))
-    enters, leaves = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
-    assert ((enters > leaves) | (enters > 1)).mean() > 0.9
-
-
 def test_a_panel_shows_the_values_and_what_blocks_the_target(another_server):
     from mechsearch_jax.envs.viewer.viewer import Viewer
 
@@ -169,79 +132,6 @@ def test_a_panel_shows_the_values_and_what_blocks_the_target(another_server):
     assert node(server, "/blocked/1").visible
     colour = node(server, "/recognised/1/0").color
     np.testing.assert_allclose(colour, 255 * drawing.rgb(drawing.ACTION), atol=1)
-
-
-def test_words_are_escaped():
-    evil = "<script>alert(1)</script>"
-    assert evil not in card(Ending(False, evil, evil))
-
-
-def test_time_goes_on_while_it_is_played_and_ends(viewer):
-    viewer.show(viewer.count - 3)
-    viewer.play(True)
-    moments = iter([True] * 6)
-    viewer.run(lambda: next(moments, False))
-    assert viewer.row == viewer.count - 1
-    assert not viewer.playing
-    viewer.play(True)
-    assert viewer.row == 0
-    viewer.play(False)
-
-
-def test_the_pieces_of_the_robot_are_the_solids_of_the_film():
-    q, opening = np.array([[0.1, -1.0, 0.2, -2.0, 0.1, 1.5, 0.7]]), 0.03
-    poses = link_poses(q)[0]
-    *pieces, foot = panda_pieces()
-    frames = [*poses, *(poses[7] for _ in range(2))]
-    frames[8], frames[9] = (frames[8].copy() for _ in range(2))
-    for frame, side in ((frames[8], 1), (frames[9], -1)):
-        frame[:3, 3] += side * opening / 2 * frame[:3, 1]
-    placed = [
-        T[:3, :3] @ solid.position + T[:3, 3] for T, solids in zip(frames, pieces, strict=True) for solid in solids
-    ]
-    drawn = panda_solids(poses, opening)
-    np.testing.assert_allclose(placed, [solid.position for solid in drawn[1:]], atol=1e-6)
-    np.testing.assert_allclose(foot[0].position, drawn[0].position)
-
-
-def test_meshes_are_as_large_as_what_they_show():
-    capsule = Capsule().mesh((0.1, 0.1, 0.3))
-    np.testing.assert_allclose(capsule.bounds, [[-0.1, -0.1, -0.3], [0.1, 0.1, 0.3]], atol=5e-3)
-    box, *rest = web.meshes_of(OBJECTS)
-    low, high = box.vertices.min(axis=0), box.vertices.max(axis=0)
-    np.testing.assert_allclose(high - low, 2 * np.asarray(OBJECTS.size[0]), rtol=1e-3)
-    assert not any(rest)
-    corners = box.vertices[box.faces]
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    away = corners.mean(axis=1) - np.asarray(OBJECTS.position[0])
-    assert (np.einsum("ij,ij->i", outward, away) > -1e-12).all()
-    assert web.arrow_mesh(np.zeros(3), np.array([1e-3, 0.0, 0.0])) is None
-    start, end = np.array([0.5, 0.1, 0.5]), np.array([0.6, 0.1, 0.5])
-    np.testing.assert_allclose(web.arrow_mesh(start, end).vertices[:, 0].max(), 0.6, atol=1e-6)
-
-
-def test_a_missing_library_is_reported_in_one_line(monkeypatch, tmp_path):
-    save_recording(RECORDING, tmp_path / NAME)
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r"pip install 'mechsearch-jax\[viewer\]'") as refused:
-        cli.parse(["view", str(tmp_path)])()
-    assert "\n" not in str(refused.value)
-
-
-WRONG = {
-    "no recording": ([], "recording.npz: there is none; search once more with --record"),
-    "port": (["--port", "0"], "view: --port 0 is not between 1 and 65535"),
-    "fps": (["--fps", "0"], "view: --fps 0 is not between 1 and 60"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG, ids=list(WRONG))
-def test_what_cannot_be_shown_is_refused_at_once(case, tmp_path):
-    pytest.importorskip("viser")
-    more, message = WRONG[case]
-    with pytest.raises(InputError) as refused:
-        cli.parse(["view", str(tmp_path), *more])()
-    assert message in str(refused.value)
 
 
 def pixel(browser, server, point):

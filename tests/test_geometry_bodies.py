@@ -1,6 +1,5 @@
 """Bodies of several parts: they are hit and seen where any part is, whatever the order of the parts."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -18,10 +17,6 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import exponential, make, transform, yaw_rotation
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.session.state import beginning, load_state, save_state
-from mechsearch_jax.viz import drawing
-from mechsearch_jax.viz.maps import Maps, load_maps, save_maps
-from mechsearch_jax.viz.web import GRID, meshes_of
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 
@@ -269,38 +264,3 @@ def test_the_part_between_the_fingers_is_found():
     at = lambda point: bodies.grasped_shape(scene, jnp.int32(0), jnp.float32(point))  # noqa: E731
     np.testing.assert_allclose(at((0.055, 0.0, 0.0)).exponents, BOX)
     np.testing.assert_allclose(at((-0.01, 0.0, 0.02)).exponents, CYLINDER)
-
-
-# --- how they are drawn and kept -------------------------------------------------------------------------------------
-
-
-def test_a_body_is_drawn_with_all_its_parts():
-    scene = drawn(7)
-    shown = drawing.surfaces(scene, GRID)
-    assert shown[-1] is None
-    for i in range(2):
-        count = int(scene.parts.valid[i].sum())
-        assert shown[i].shape == (count * GRID[0] * GRID[1], 3)
-        outline = drawing.outlines(scene)[i]
-        reach = np.asarray(bodies.placed_parts(scene).position[i])[np.asarray(scene.parts.valid[i])]
-        low, high = outline.min(axis=0), outline.max(axis=0)
-        assert np.all(reach[:, :2] > low)
-        assert np.all(reach[:, :2] < high)
-        mesh = meshes_of(scene)[i]
-        assert mesh.faces.max() == len(mesh.vertices) - 1
-    assert meshes_of(scene)[-1] is None
-
-
-@pytest.mark.parametrize("scene", [drawn(7), single(7)], ids=["parts", "single"])
-def test_maps_keep_the_parts_of_bodies(scene, tmp_path):
-    kept = Maps(np.zeros((2, 3)), np.ones(2, bool), np.ones(2, int), jax.tree.map(np.asarray, scene))
-    save_maps(kept, tmp_path / "maps.npz")
-    same(load_maps(tmp_path / "maps.npz").scene, scene)
-
-
-def test_a_saved_search_keeps_the_parts_of_bodies(problem, tmp_path):
-    begun = beginning(problem)
-    objects = superquadric.pad(drawn(7), begun.observation.objects.capacity)
-    begun = dataclasses.replace(begun, observation=begun.observation.replace(objects=objects))
-    save_state(begun, "digest", tmp_path / "search.npz")
-    same(load_state(problem, "digest", tmp_path / "search.npz").observation.objects, objects)

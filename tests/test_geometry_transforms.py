@@ -1,11 +1,14 @@
-"""Rigid transforms against NumPy in float64."""
+"""Rigid transforms, and points that are spread far from each other."""
 
 import jax.numpy as jnp
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from scipy.spatial.distance import cdist
 
 from mechsearch_jax.geometry import transforms
+from mechsearch_jax.geometry.spreading import farthest_points
 
 
 def random_transforms(seed, *shape):
@@ -45,3 +48,26 @@ def test_an_upright_pose_keeps_z_up():
     np.testing.assert_allclose(T[:3, 2], [0, 0, 1])
     np.testing.assert_allclose(T[:3, 3], [0.5, 0.1, 0.45])
     np.testing.assert_allclose(jnp.arctan2(T[1, 0], T[0, 0]), 0.7, rtol=1e-6)
+
+
+# Few different numbers, so that distances are often equal.
+POINTS = arrays.arrays(
+    np.float64, st.tuples(st.integers(1, 30), st.integers(1, 4)), elements=st.integers(-3, 3).map(lambda i: i / 4)
+)
+
+
+@given(points=POINTS, count=st.integers(1, 30), first=st.integers(0, 29))
+def test_each_point_is_the_farthest_from_all_before(points, count, first):
+    """Against all distances; whoever gives them may use the same array each time."""
+    first, apart = first % len(points), cdist(points, points, "sqeuclidean")
+    room = np.empty(len(points))
+
+    def distance(i):
+        room[:] = apart[i]
+        return room
+
+    chosen = farthest_points(count, first, distance)
+    expected = [first]
+    while len(expected) < count:
+        expected.append(int(np.argmax(apart[expected].min(axis=0))))
+    assert chosen.tolist() == expected

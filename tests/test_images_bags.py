@@ -143,12 +143,3 @@ def test_several_topics_of_a_kind_have_to_be_told_apart(bag):
         bag_images(bag.path, POSED)
     with pytest.raises(InputError, match=r"/a/colour has no image within 0\.1 s"):
         bag_images(bag.path, POSED, topics={"depth": "/b/depth"})
-
-
-def test_what_is_no_bag_is_refused_in_one_line(tmp_path):
-    (tmp_path / "empty.bag").write_bytes(b"")
-    (tmp_path / "folder").mkdir()
-    for name in ("empty.bag", "folder", "missing"):
-        with pytest.raises(InputError, match=f"{name}: is no bag that can be read") as refused:
-            bag_images(tmp_path / name, POSED)
-        assert len(str(refused.value).splitlines()) == 1

@@ -124,13 +124,6 @@ def test_beyond_where_the_polynomial_turns_back_nothing_was_seen():
     assert (np.diff(row) > 0).all()
 
 
-def test_without_distortion_images_stay_as_they_are():
-    depth = np.random.default_rng(0).random((240, 320)).astype(np.float32)
-    assert Lens(CAMERA, (0.0,) * 5).depth(depth) is depth
-    with pytest.raises(InputError, match=r"depth image: its shape is \(320, 240\)"):
-        Lens(CAMERA, (0.1, 0.0, 0.0, 0.0)).depth(depth.T)
-
-
 @pytest.mark.parametrize(
     ("model", "D", "words"),
     [
@@ -143,11 +136,6 @@ def test_without_distortion_images_stay_as_they_are():
 def test_a_lens_that_is_not_understood_is_refused(model, D, words):
     with pytest.raises(InputError, match=f"^camera: {words}"):
         distortion_of(model, D, "camera")
-
-
-def test_a_lens_has_no_more_numbers_than_are_understood():
-    with pytest.raises(InputError, match="Lens: distortion has 12 numbers"):
-        Lens(CAMERA, (0.1,) * 12)
 
 
 def test_a_file_of_a_camera_keeps_its_lens(tmp_path):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,6 @@ from mechsearch_jax.networks.push_geometry import POINTS, push_geometry, push_st
 from mechsearch_jax.networks.weights import read_card, save_weights
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -138,14 +136,6 @@ def test_turning_and_moving_everything_turns_and_moves_the_answer(seed, yaw, x, 
     assert_same(before, after.replace(shift=turned_back(yaw, after.shift)))
 
 
-@pytest.mark.slow
-def test_the_baseline_is_not_equivariant():
-    config = dataclasses.replace(CONFIG, frame="world")
-    case = cluttered(1)
-    before, after = prediction(*case, config=config), prediction(*moved(0.7, 0.0, 0.0, *case), config=config)
-    assert np.abs(np.asarray(before.shift) - turned_back(0.7, after.shift)).max() > 5e-3
-
-
 def mirror_image(scene, T, displacement, middle=0.0):
     """The push seen in a mirror along x: y is the other way round. The hand is its own mirror image."""
     flip = jnp.float32([1.0, -1.0, 1.0])
@@ -162,21 +152,6 @@ def test_a_mirrored_push_has_the_mirrored_outcome(seed):
     a = prediction(*case, shelf=SHELF, points=symmetric_points())
     b = prediction(*mirror_image(*case, middle), shelf=SHELF, points=symmetric_points())
     assert_same(a, b.replace(shift=b.shift * jnp.float32([1.0, -1.0])[None], turn=-b.turn))
-
-
-def test_a_symmetric_push_goes_straight_and_turns_nothing():
-    # The shelf's middle is at the push: its walls are as far to the left as to the right.
-    scene = standing(
-        ((0.03, 0.04, 0.06), BOX, 0.6, 0.1, 0.0),
-        ((0.03, 0.03, 0.06), ROUND, 0.68, 0.02, 0.4),
-        ((0.03, 0.03, 0.06), ROUND, 0.68, 0.18, 0.9),
-    )
-    case = superquadric.pad(scene, 5), gripper_at(0.5, 0.1), jnp.float32([0.1, 0.0, 0.0])
-    motion = prediction(*case, shelf=SHELF, points=symmetric_points())
-    np.testing.assert_allclose(
-        [motion.shift[0, 1], motion.turn[0], motion.shift[1, 1] + motion.shift[2, 1]], 0.0, atol=1e-5
-    )
-    assert abs(float(motion.shift[1, 1])) > 1e-4
 
 
 def test_a_box_after_half_a_turn_and_a_cylinder_after_any_are_the_same():
@@ -303,59 +278,6 @@ def test_the_distance_between_objects_is_that_of_small_steps():
     assert count >= 2
 
 
-def test_how_objects_meet_is_known_where_it_is_plain():
-    # The second is 2 cm to the left of straight ahead, the third askew, with a corner ahead; the fourth is passed by.
-    scene = standing(
-        ((0.02, 0.03, 0.05), BOX, 0.6, 0.0, 0.0),
-        ((0.02, 0.02, 0.05), BOX, 0.7, 0.02, np.pi / 2),
-        ((0.02, 0.02, 0.05), BOX, 0.7, -0.05, np.radians(30)),
-        ((0.02, 0.02, 0.05), ROUND, 0.7, 0.2, 0.0),
-    )
-    met = jax.jit(contacts.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
-    assert float(met.distance[0, 1]) == pytest.approx(0.06, abs=1e-6)
-    np.testing.assert_allclose(met.normal[0, 1], [1.0, 0.0], atol=1e-5)
-    # From 0 to 3 cm to the left of the first's centre, and from 2 cm to the right to 1 cm to the left of the second's.
-    np.testing.assert_allclose([met.middle[0, 1], met.breadth[0, 1]], [0.015, 0.03], atol=1e-6)
-    np.testing.assert_allclose([met.middle[1, 0], met.breadth[1, 0]], [-0.005, 0.03], atol=1e-6)
-    # The right front corner of the first meets the left one of the third's near sides.
-    np.testing.assert_allclose(met.normal[0, 2], [np.sin(np.radians(30)), -np.cos(np.radians(30))], atol=1e-4)
-    assert float(met.breadth[0, 3]) == pytest.approx(0.2 - 0.02 - 0.03 - 2 * 0.15, abs=1e-6)
-    assert float(met.distance[0, 3]) == pytest.approx(REACH)
-
-
-@pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_at_cylinders_objects_meet_along_the_line_to_their_axis(yaw):
-    # Two cylinders, 2.4 cm askew; a box, whose right front corner the first meets, and one whose face it meets.
-    scene = standing(
-        ((0.03, 0.03, 0.05), ROUND, 0.6, 0.0, 0.0),
-        ((0.05, 0.05, 0.05), ROUND, 0.8, 0.024, 0.0),
-        ((0.02, 0.02, 0.05), BOX, 0.72, 0.038, 0.0),
-        ((0.02, 0.06, 0.05), BOX, 0.70, -0.05, 0.0),
-    )
-    prints = footprints.footprints(scene)
-    centre = prints.position[:1]
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = jnp.float32([[c, -s], [s, c]])
-    around = jnp.matmul(prints.position - centre, turn.T, precision="highest") + centre
-    prints = prints.replace(position=around, yaw=prints.yaw + yaw)
-    met = jax.jit(contacts.meetings)(prints, turn[:, 0])
-    normal = jnp.matmul(met.normal, turn, precision="highest")
-    along = np.sqrt(0.08**2 - 0.024**2)
-    assert float(met.distance[0, 1]) == pytest.approx(0.2 - along, abs=2e-4)
-    np.testing.assert_allclose(normal[0, 1], [along / 0.08, 0.3], atol=5e-3)
-    # From the corner of the box, 1.8 cm to the left, to the axis.
-    along = np.sqrt(0.03**2 - 0.018**2)
-    assert float(met.distance[0, 2]) == pytest.approx(0.1 - along, abs=4e-4)
-    np.testing.assert_allclose(normal[0, 2], [along / 0.03, 0.6], atol=2e-2)
-    assert float(met.distance[0, 3]) == pytest.approx(0.05, abs=1e-5)
-    np.testing.assert_allclose(normal[0, 3], [1.0, 0.0], atol=1e-5)
-    # A box on its way to a cylinder, to the right of it.
-    heading = -turn[:, 0]
-    back = jax.jit(contacts.meetings)(prints, heading)
-    assert float(back.distance[2, 0]) == pytest.approx(float(met.distance[0, 2]), abs=1e-5)
-    np.testing.assert_allclose(back.normal[2, 0], -met.normal[0, 2], atol=1e-5)
-
-
 def test_cylinders_that_touch_are_not_met_on_the_way_apart():
     # The second is half a millimetre behind the first and to its left.
     away = 0.0805 * np.array([-np.cos(0.5), np.sin(0.5)])
@@ -366,32 +288,6 @@ def test_cylinders_that_touch_are_not_met_on_the_way_apart():
     assert float(met.gap[0, 1]) == pytest.approx(5e-4, abs=1e-6)
     assert float(met.distance[0, 1]) == pytest.approx(REACH)
     assert float(met.distance[1, 0]) == pytest.approx(5e-4 / np.cos(0.5), abs=2e-4)
-
-
-def test_an_object_reaches_as_far_as_its_outline():
-    scene, _, _ = cluttered(8)
-    prints = footprints.footprints(scene)
-    for i in range(5):
-        outline = outline_of(prints, i, 4000) - np.asarray(prints.position[i])
-        for direction in ([1.0, 0.0], [0.6, 0.8]):
-            extent = contacts.reach(prints, jnp.broadcast_to(jnp.float32(direction)[None], (5, 2)))[i]
-            assert float(extent) == pytest.approx((outline @ direction).max(), abs=2e-4)
-
-
-def test_how_two_objects_meet_is_a_feature_of_both():
-    # The gripper is 4 cm before the first, which is 6 cm before the second, whose middle is 2 cm to the left.
-    scene = standing(((0.02, 0.03, 0.05), BOX, 0.6, 0.0, 0.0), ((0.02, 0.02, 0.08), BOX, 0.7, 0.02, 0.0))
-    start = push_start(OPEN, scene, jnp.zeros((1, 3)), gripper_at(0.54, 0.0), jnp.float32([0.15, 0.0, 0.0]))
-    pairs = jax.jit(push_geometry)(start).pairs
-    # onward and back, how far each carries the other, gap, overlap in height, breadth, then along the push: offset,
-    # the normals of either, nothing. All lengths are in units of 10 cm; the second never comes back to the first.
-    ahead = [0.06, REACH, 0.15 - 0.04 - 0.06, 0.0, 0.06, 0.1, 0.03, 0.1]
-    back = [REACH, 0.06, 0.0, 0.15 - 0.04 - 0.06, 0.06, 0.1, 0.03, -0.1]
-    np.testing.assert_allclose(pairs.even[0, 1], [*[10 * a for a in ahead], 1.0, 1.0, 0.0], atol=1e-5)
-    np.testing.assert_allclose(pairs.even[1, 0], [*[10 * a for a in back], 1.0, 1.0, 0.0], atol=1e-5)
-    # Across it: offset, the normals, and the middle of where they overlap, from either.
-    np.testing.assert_allclose(pairs.odd[0, 1], [0.2, 0.0, 0.0, 0.15], atol=1e-5)
-    np.testing.assert_allclose(pairs.odd[1, 0], [-0.2, 0.0, 0.0, -0.05], atol=1e-5)
 
 
 def test_an_object_is_reached_through_another():
@@ -500,12 +396,6 @@ def test_a_push_is_resolved_up_to_the_overlap_that_is_allowed():
     assert left[0] == left[1] == left[2] > 0.01
 
 
-@pytest.mark.parametrize("wrong", [{"likely": 1.5}, {"likely": float("nan")}, {"max_penetration": -0.01}])
-def test_impossible_thresholds_are_refused(weights, wrong):
-    with pytest.raises(InputError, match=r"LearnedPush: likely .* max_penetration"):
-        LearnedPush(weights, **wrong)
-
-
 def test_the_weights_that_ship_push_as_one_expects():
     model = LearnedPush()
     body = (0.03, 0.04, 0.06), BOX
@@ -529,43 +419,3 @@ def test_the_weights_that_ship_push_as_one_expects():
 def test_the_network_that_ships_is_not_traced_before_it_is_needed(monkeypatch):
     monkeypatch.setattr(learned, "load_weights", None)
     assert LearnedPush().digest == read_card(LearnedPush().path, "push")["sha256"]
-
-
-def test_models_of_the_same_weights_are_the_same_to_jit(weights, tmp_path):
-    other = tmp_path / "other.npz"
-    save_weights(other, "push", CONFIG, jax.tree.map(lambda a: a + 0.1, parameters()), {})
-    one, again, another = LearnedPush(weights), LearnedPush(weights), LearnedPush(other)
-    assert one == again
-    assert hash(one) == hash(again)
-    assert one != another
-
-
-@pytest.mark.parametrize("damage", ["cut short", "no card", "another network", "missing"])
-def test_damaged_weights_are_refused_in_one_line(weights, damage):
-    if damage == "cut short":
-        weights.write_bytes(weights.read_bytes()[:-100])
-    elif damage == "no card":
-        weights.with_suffix(".json").write_text("{}")
-    elif damage == "another network":
-        card = json.loads(weights.with_suffix(".json").read_text()) | {"network": "recognition"}
-        weights.with_suffix(".json").write_text(json.dumps(card))
-    else:
-        weights.unlink()
-    with pytest.raises(InputError) as refused:
-        LearnedPush(weights)
-    assert str(weights.parent) in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-def test_the_network_that_is_trained_is_small():
-    scene, T, displacement = cluttered(0)
-    shapes = jax.eval_shape(
-        lambda: PushNetwork().init(jax.random.key(0), push_start(SHELF, scene, pusher(), T, displacement))
-    )
-    assert sum(a.size for a in jax.tree.leaves(shapes)) < 250_000
-
-
-@pytest.mark.parametrize("wrong", [{"width": 0}, {"layers": 0}, {"frame": "gripper"}])
-def test_impossible_networks_are_refused(wrong):
-    with pytest.raises(InputError):
-        PushConfig(**wrong)

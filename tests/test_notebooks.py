@@ -1,6 +1,5 @@
 """The notebooks: they are stored as they were executed, their links lead somewhere, and their code runs."""
 
-import base64
 import contextlib
 import io
 import json
@@ -8,10 +7,8 @@ import re
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from mechsearch_jax.benchmarks.lab.site import notebooks
-from mechsearch_jax.runtime.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / notebooks.FOLDER
@@ -64,49 +61,6 @@ def test_its_links_lead_somewhere(name):
 def test_each_has_a_page_in_the_navigation():
     navigation = re.findall(r"notebooks/(.+)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(navigation) == NAMES
-
-
-def picture(colours):
-    image = Image.new("RGB", (colours, 4))
-    image.putdata([(i % 256, 5 * i % 256, 255 - i % 256) for i in range(colours)] * 4)
-    file = io.BytesIO()
-    image.save(file, format="PNG")
-    return base64.b64encode(file.getvalue()).decode()
-
-
-def test_what_differs_between_runs_is_left_out_and_pictures_get_few_colours():
-    output = {
-        "output_type": "display_data",
-        "data": {"image/png": picture(300), "text/plain": ["<Figure at 0x7f>"]},
-        "metadata": {"needs_background": "light"},
-    }
-    printed = {"output_type": "stream", "name": "stdout", "text": ["\x1b[1;32mbold\x1b[0m\n", "plain\n"]}
-    code = {"cell_type": "code", "source": ["a"], "execution_count": 1, "metadata": {"time": 3}}
-    code["outputs"] = [output, printed]
-    text = {"cell_type": "markdown", "source": ["b"], "metadata": {"time": 3}}
-    tidy = notebooks.tidied({"cells": [text, {**code, "id": "x7"}], "metadata": {"version": 3}, "nbformat": 4})
-    assert tidy["metadata"] == notebooks.METADATA
-    assert [(cell["id"], cell["metadata"]) for cell in tidy["cells"]] == [("cell-00", {}), ("cell-01", {})]
-    shown, said = tidy["cells"][1]["outputs"]
-    assert said["text"] == ["bold\n", "plain\n"]
-    assert set(shown["data"]) == {"image/png"}
-    with Image.open(io.BytesIO(base64.b64decode(shown["data"]["image/png"]))) as image:
-        assert image.size == (300, 4)
-        assert len(image.getcolors()) <= notebooks.COLOURS
-    assert notebooks.tidied(tidy) == tidy
-
-
-def test_a_notebook_that_fails_or_grows_is_not_stored(tmp_path, monkeypatch):
-    path = tmp_path / "large.ipynb"
-    path.write_text(json.dumps({"cells": [], "metadata": {}, "nbformat": 4, "nbformat_minor": 5}))
-    before = path.read_bytes()
-    large = {"cells": [{"cell_type": "markdown", "source": "x" * notebooks.LARGEST}], "metadata": {}}
-    monkeypatch.setattr(notebooks, "executed", lambda notebook: large)
-    with pytest.raises(InputError, match=r"large\.ipynb: has \d+ bytes, more than"):
-        notebooks.write("large", tmp_path)
-    assert path.read_bytes() == before
-    with pytest.raises(SystemExit):
-        notebooks.main(["yours", "--folder", str(tmp_path)])
 
 
 def run(name, tmp_path, monkeypatch, changes=()):

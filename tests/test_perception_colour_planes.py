@@ -139,20 +139,3 @@ def test_plane_is_found_among_outliers(seed):
     assert 550 < plane.support < 750
     again = planes.find_plane(*arguments)
     assert jax.tree.all(jax.tree.map(jnp.array_equal, plane, again))
-
-
-def test_no_plane_where_there_is_none():
-    plane = planes.find_plane(jax.random.key(0), jnp.zeros((50, 3)), jnp.ones(50, bool))
-    assert plane.support == 0
-    np.testing.assert_array_equal(plane.normal, [0.0, 0.0, 1.0])
-    plane = planes.find_plane(jax.random.key(0), jnp.full((50, 3), jnp.nan), jnp.zeros(50, bool))
-    assert plane.support == 0
-
-
-def test_configurations_refuse_what_makes_no_sense():
-    for wrong in (
-        lambda: TargetColour(rgb=(2.0, 0.0, 0.0)),
-        lambda: TargetColour(threshold=0.0),
-    ):
-        with pytest.raises(InputError):
-            wrong()

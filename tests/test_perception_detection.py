@@ -86,12 +86,6 @@ def test_without_the_target_nothing_is_detected():
     assert not no_detection(jnp.zeros((3, 4))).visible
 
 
-@pytest.mark.slow
-def test_another_hue_is_not_the_targets():
-    found, _ = seen(LARGE, PALETTE[1], detector=TargetColour.lit((0.1, 0.3, 0.8)))
-    assert not found.visible
-
-
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_thing_of_the_targets_colour_but_not_of_its_shape_and_size_is_an_object(name):
     found, _ = seen(OTHERS[name], RED, can=None)
@@ -153,15 +147,6 @@ def test_the_densest_place_is_on_the_largest_thing():
     x, y, _ = np.asarray(densest_place(KEY, Target.cylinder(), points, scattered))
     assert 0.02 <= x <= 0.07
     assert 0.02 <= y <= 0.05
-
-
-def test_the_tolerance_is_four_deviations_of_the_depths_noise():
-    depth = 0.7 + 0.001 * jnp.arange(100.0)[None] + 0.0012 * jax.random.normal(KEY, (100, 100))
-    assert float(depth_tolerance(depth, jnp.ones((100, 100), bool))) == pytest.approx(0.0048, rel=0.03)
-    rough = depth.at[:, ::10].set(jnp.nan)
-    assert float(depth_tolerance(rough, jnp.ones((100, 100), bool))) == pytest.approx(0.0048, rel=0.05)
-    assert float(depth_tolerance(jnp.full((5, 5), 0.7), jnp.ones((5, 5), bool))) == pytest.approx(0.003)
-    assert float(depth_tolerance(depth, jnp.zeros((100, 100), bool))) == pytest.approx(0.008)
 
 
 def test_noise_that_neighbours_share_is_in_the_tolerance():

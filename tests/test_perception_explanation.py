@@ -10,12 +10,11 @@ import pytest
 from mechsearch_jax.images.cloud import above_board, thinned_view
 from mechsearch_jax.images.labels import CAPACITY, FREE, OTHER
 from mechsearch_jax.perception.confidence import Measures, confidence_of
-from mechsearch_jax.perception.explanation import Explaining, ExplanationConfig
-from mechsearch_jax.perception.hypotheses import WAYS, distinct
+from mechsearch_jax.perception.explanation import Explaining
+from mechsearch_jax.perception.hypotheses import WAYS
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.selection import Costs, moves_of, sample_of, select_objects
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, rays
 from mechsearch_jax.workspace.render import object_depth
 from mechsearch_jax.workspace.scenario import Body, superquadrics
@@ -190,15 +189,6 @@ def test_pixels_of_no_segment_speak_for_no_object():
     assert selection(bodies, bodies, segmented=1)[0] == [0]
 
 
-def test_ways_that_divide_a_segment_alike_are_one():
-    first = np.zeros((1, WAYS, 10, 10), bool)
-    first[0, 0, :5] = True
-    # The other half, and half of it.
-    first[0, 1, 5:] = True
-    first[0, 2, :3] = True
-    assert distinct(jnp.asarray(first), jnp.array([100])).tolist() == [[True, False, True]]
-
-
 def test_confidence_falls_with_what_is_measured():
     """Each measure alone makes an object less sure; an absent object has no confidence."""
     sure = {"valid": True, "pixels": 500, "misfit": 0.0, "error": 0.001, "margin": np.inf}
@@ -209,13 +199,3 @@ def test_confidence_falls_with_what_is_measured():
     assert 0.95 < best < 1.0
     assert all(other < best for other in others)
     assert others[-1] == 0.0
-
-
-def test_impossible_settings_are_refused():
-    with pytest.raises(InputError, match="gain"):
-        ExplanationConfig(gain=-1.0)
-    with pytest.raises(InputError, match=r"wrong \(0.0\) must be positive"):
-        ExplanationConfig(wrong=0.0)
-    with pytest.raises(InputError, match="at most 16"):
-        ExplanationConfig(splits=17)
-    assert ExplanationConfig(splits=0, gain=0.0).splits == 0

@@ -18,9 +18,8 @@ from mechsearch_jax.geometry.bodies import world_parts
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge
 from mechsearch_jax.perception.explanation import as_segmented
 from mechsearch_jax.perception.parts.divisions import BOX, CYLINDER, ELLIPSOID, best_cut
-from mechsearch_jax.perception.parts.in_parts import InParts, PartsConfig, depth_noise, in_parts
+from mechsearch_jax.perception.parts.in_parts import PartsConfig, depth_noise, in_parts
 from mechsearch_jax.perception.parts.joining import join_floating, separate
-from mechsearch_jax.perception.parts.segments import Connected
 from mechsearch_jax.perception.parts.unions import (
     Evidence,
     Table,
@@ -33,7 +32,6 @@ from mechsearch_jax.perception.parts.unions import (
 from mechsearch_jax.perception.recogniser import labelled
 from mechsearch_jax.perception.recognition import ShapeNetwork
 from mechsearch_jax.perception.refinement import RefinementConfig
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.compound import inside, solids
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, pieces_of, rotation_matrix
@@ -165,14 +163,6 @@ def test_a_segment_that_floats_is_another_ones_where_bodies_are_joined():
     np.testing.assert_array_equal(other.objects.parts.valid, kept.objects.parts.valid)
 
 
-def test_parts_are_off_unless_they_are_named():
-    assert recogniser("masks", TARGET).core.mask_fitter is as_segmented
-    # A mask's segments are kept.
-    assert recogniser("masks-parts", TARGET).core.mask_fitter == InParts(as_segmented, joining=separate)
-    assert recogniser("full-parts", TARGET).core.fitter == InParts(Connected(), joining=join_floating)
-    assert not isinstance(recogniser("full", TARGET).core.fitter, InParts)
-
-
 @pytest.mark.slow
 def test_bodies_of_parts_are_the_same_alone_traced_and_in_a_batch():
     (image, view, base), (other, _, plain_base) = seen(*THINGS), seen(*PLAIN)
@@ -279,10 +269,3 @@ def test_the_noise_of_the_depth_is_measured_on_the_segments_alone():
     # 1 mm in a random direction.
     assert 0.0004 < float(depth_noise(image, base.labels)) < 0.0009
     assert float(depth_noise(image, jnp.full_like(base.labels, -2))) == 0.0
-
-
-def test_impossible_costs_are_refused_in_one_line():
-    with pytest.raises(InputError, match=r"^PartsConfig: wrong \(0.0\) must be positive$"):
-        PartsConfig(wrong=0.0)
-    with pytest.raises(InputError, match=r"^PartsConfig: part \(-1.0\) must be at least 0$"):
-        PartsConfig(part=-1.0)

@@ -135,17 +135,6 @@ def test_segments_are_the_objects(images, seed, masked):
     assert np.all((points > low) & (points < high))
 
 
-def test_noise_in_the_colours_splits_nothing(images):
-    depth, _ = sensed(CAMERA, *images[:2], 0)
-    colour = images[1] + np.random.default_rng(0).normal(0, 8 / 255, images[1].shape)
-    colour = np.float32(np.round(255 * np.clip(colour, 0, 1)) / 255)
-    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, None, JOINTS, OPENING)
-    segmentation = np.array(prepared.segmentation)
-    assert segmentation.max() == 3
-    assert prepared.detection.found
-    assert np.mean(segmentation[(images[2] == TARGET) & (depth > 0)] == int(prepared.target_id)) > 0.9
-
-
 def test_labels_are_those_that_a_recogniser_takes(images):
     """The shelf is FREE, the robot OTHER, and what was not measured MISSING."""
     owners = images[2]
@@ -191,22 +180,6 @@ def test_the_same_key_gives_the_same_and_the_given_pose_stays_without_joints(ima
     assert first.target_id == OTHER
     assert first.pose is None
     assert first.camera == CAMERA
-
-
-def test_too_little_of_the_robot_leaves_the_pose_as_it_was(images):
-    depth, colour, owners = images
-    depth = np.where(owners == ROBOT, 0.0, depth).astype(np.float32)
-    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, None, JOINTS, OPENING)
-    assert not prepared.pose.corrected
-    np.testing.assert_allclose(prepared.pose.T_world_camera, pose_of(CAMERA), atol=1e-6)
-
-
-def test_an_empty_shelf_has_no_segments(images):
-    depth, colour, owners = images
-    depth = np.where(owners == SHELF, depth, 0.0).astype(np.float32)
-    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour)
-    np.testing.assert_array_equal(prepared.segmentation, np.where(depth > 0, FREE, MISSING))
-    assert not prepared.detection.found
 
 
 def test_bad_images_are_refused_in_one_line(images):

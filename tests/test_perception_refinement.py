@@ -16,7 +16,6 @@ from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.images.noise import TimeOfFlight, measured_depth
 from mechsearch_jax.perception import refinement, scores
 from mechsearch_jax.perception.refinement import RefinementConfig
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera, back_project, pixel_rays, project
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
@@ -234,41 +233,6 @@ def test_rays_bound_what_no_point_bounds():
 
 
 @pytest.mark.slow
-def test_alone_is_the_same_as_in_a_batch():
-    rng = np.random.default_rng(5)
-    points, labels, depth, truth = measured([SCENE, SCENE], rng, 0.001)
-    guess = disturbed(truth, rng)
-    together = jax.vmap(functools.partial(refinement.refine, CAMERA, SHELF, config=ROUGH))(guess, points, labels, depth)
-    alone = refiner()(guess, points, labels, depth)
-    # Sums are rounded in another order, and what is accepted or refused may turn on it.
-    seen = np.array(truth.valid)
-    np.testing.assert_allclose(together.scene.position[seen], alone.scene.position[seen], atol=2e-3)
-    assert iou(together.scene, alone.scene.replace(exponents=truth.exponents))[seen].min() > 0.9
-
-
-@pytest.mark.slow
-def test_forward_gradients_are_finite():
-    rng = np.random.default_rng(6)
-    points, labels, depth, truth = measured([SCENE], rng, 0.001)
-    guess = disturbed(truth, rng)
-    config = RefinementConfig(stages=((1, 0.01),), points=32, rays=32, hypotheses=())
-
-    def total(size):
-        refined = refinement.refine(CAMERA, SHELF, guess_of(size), points[0], labels[0], depth[0], config)
-        return jnp.sum(refined.scene.size) + jnp.sum(refined.scene.position)
-
-    def guess_of(size):
-        return jax.tree.map(lambda a: a[0], guess).replace(size=size)
-
-    for seed in range(3):
-        tangent = jnp.asarray(rng.normal(size=(8, 3)), jnp.float32)
-        value, derivative = jax.jvp(jax.jit(total), (guess.size[0],), (tangent,))
-        assert jnp.isfinite(value), seed
-        assert jnp.isfinite(derivative), seed
-        assert derivative != 0
-
-
-@pytest.mark.slow
 def test_reverse_gradients_are_finite():
     rng = np.random.default_rng(6)
     points, labels, depth, truth = measured([SCENE], rng, 0.001)
@@ -359,15 +323,3 @@ def test_points_are_selected_evenly():
     assert jnp.sum(weight) == 500
     np.testing.assert_array_equal(np.sort(index[:500]), np.flatnonzero(labels == 1))
     assert jnp.sum(refinement.select(labels, jnp.int32(7), 100)[1]) == 0
-
-
-def test_configurations_refuse_what_makes_no_sense():
-    for wrong in (
-        {"points": 0},
-        {"noise": -1.0},
-        {"stages": ()},
-        {"hypotheses": ((0.0, 1.0, 0.0),)},
-        {"hypotheses": ((0.2, 1.9, 0.0),)},
-    ):
-        with pytest.raises(InputError):
-            RefinementConfig(**wrong)

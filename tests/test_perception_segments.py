@@ -1,4 +1,6 @@
-"""Segments of things of any shape: cut where depth jumps, joined where it does not."""
+"""Segments: cut, joined, kept, and numbered."""
+
+import types
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +14,16 @@ from mechsearch_jax.envs.camera import recognisers
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.scenes.scene_sets import find_scene, make_scene
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.images.labels import CAPACITY, FREE, MISSING, OTHER
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.bodies import PARTS
+from mechsearch_jax.images.labels import CAPACITY, FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.trained_view import TrainedView
+from mechsearch_jax.networks import segmentation as networks
+from mechsearch_jax.perception.parts.joining import FLOATS, TOUCHES, join_floating
 from mechsearch_jax.perception.parts.segments import Connected, SegmentsConfig, connected_segments
+from mechsearch_jax.perception.parts.unions import Evidence
 from mechsearch_jax.perception.recogniser import labelled
-from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.perception.segmentation import NetworkSegmenter, leave_out_smallest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import SAMPLED, found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
@@ -113,12 +121,6 @@ def test_pieces_are_those_of_a_reference_and_compiled_and_batched_agree(seed):
     np.testing.assert_array_equal(batched, after)
 
 
-def test_bad_settings_are_refused():
-    for wrong in ({"jump": 0.0}, {"border": -1.0}, {"least": float("nan")}):
-        with pytest.raises(InputError, match=next(iter(wrong))):
-            SegmentsConfig(**wrong)
-
-
 @pytest.mark.slow
 def test_each_household_thing_of_a_shelf_has_one_segment():
     """A drill, a bottle, a carton and a spray bottle, of which the network alone makes eight segments."""
@@ -154,3 +156,147 @@ def test_each_household_thing_of_a_shelf_has_one_segment():
     np.testing.assert_array_equal(fitted.labels, after)
     assert np.asarray(fitted.objects.valid).tolist() == [True] * 4 + [False] * 4
     assert not np.asarray(fitted.changed).any()
+
+
+BOARD = 0.4
+SIDE = 0.02
+
+
+def cubes(*places, parts=1):
+    """Bodies of upright cubes at x and at heights of their undersides above the board, with points all over them."""
+    n = len(places)
+    scene = superquadric.empty(n, PARTS)
+    there = np.zeros((n, PARTS), bool)
+    there[:, :parts] = True
+    centres = np.zeros((n, PARTS, 3), np.float32)
+    for i, (x, low) in enumerate(places):
+        centres[i] = x, 0.0, BOARD + low + SIDE
+    size = np.full((n, PARTS, 3), SIDE, np.float32)
+    pieces = scene.parts.replace(
+        valid=there, position=centres, size=size, exponents=np.full((n, PARTS, 2), 0.2, np.float32)
+    )
+    side = np.linspace(-SIDE, SIDE, 9)
+    grid = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    shell = grid[np.max(np.abs(grid), axis=1) > SIDE - 1e-6].astype(np.float32)
+    points = centres[:, :1] + shell[None]
+    count = points.shape[1]
+    evidence = Evidence(
+        points=points,
+        point_weight=np.ones((n, count), np.float32),
+        origin=np.zeros((n, 3), np.float32),
+        directions=np.ones((n, 1, 3), np.float32),
+        free=np.zeros((n, 1), np.float32),
+        ray_weight=np.ones(n, np.float32),
+        pixels=np.full(n, float(count), np.float32),
+        exact=np.full(n, 0.002, np.float32),
+    )
+    return jax.tree.map(jnp.asarray, (pieces, evidence))
+
+
+def owners(*places, parts=1):
+    after, owner = join_floating(*cubes(*places, parts=parts), BOARD)
+    return after, np.asarray(owner).tolist()
+
+
+def test_a_piece_that_stands_on_another_one_belongs_to_it():
+    after, owner = owners((0.0, 0.0), (0.2, 0.0), (0.0, 2 * SIDE + 0.5 * TOUCHES))
+    assert owner == [0, 1, 0]
+    assert np.sum(np.asarray(after.valid), axis=1).tolist() == [2, 1, 0]
+    heights = np.sort(np.asarray(after.position)[0, :2, 2])
+    np.testing.assert_allclose(heights, BOARD + SIDE + np.array([0.0, 2 * SIDE + 0.5 * TOUCHES]), atol=1e-6)
+
+
+def test_what_stands_or_touches_nothing_stays_as_it_is():
+    for places in (
+        ((0.0, 0.0), (2 * SIDE + 0.5 * TOUCHES, 0.0)),
+        ((0.0, 0.0), (0.0, 2 * SIDE + 2 * TOUCHES)),
+        ((0.0, 0.0), (2 * SIDE + 0.5 * TOUCHES, 0.5 * FLOATS)),
+    ):
+        before = cubes(*places)[0]
+        after, owner = owners(*places)
+        assert owner == list(range(len(places)))
+        jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
+def test_a_tower_is_one_body_whatever_its_order():
+    step = 2 * SIDE + 0.5 * TOUCHES
+    for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0)):
+        after, owner = owners(*((0.0, k * step) for k in order))
+        assert len(set(owner)) == 1
+        assert np.sum(np.asarray(after.valid)) == 3
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.lists(st.tuples(st.floats(0.0, 0.3), st.floats(0.0, 0.2)), min_size=3, max_size=3))
+@pytest.mark.slow
+def test_eager_compiled_and_batched_agree(places):
+    arguments = cubes(*places)
+    eager = join_floating(*arguments, BOARD)
+    compiled = jax.jit(join_floating)(*arguments, jnp.float32(BOARD))
+    batched = jax.vmap(join_floating, in_axes=(0, 0, None))(*jax.tree.map(lambda a: a[None], arguments), BOARD)
+    for other in (compiled, jax.tree.map(lambda a: a[0], batched)):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), eager, other)
+    # What is joined stays so.
+    parts, owner = jax.device_get(eager)
+    assert all(owner[owner[i]] == owner[i] for i in range(len(places)))
+    assert [bool(parts.valid[i].any()) for i in range(len(places))] == [owner[i] == i for i in range(len(places))]
+
+
+SIZES = np.array([9, 8, 3, 7, 6, 12, 5, 4, 10])
+
+
+def stripes(sizes):
+    """One row of pixels for each segment, so many long; beside them the shelf, and a pixel that was not measured."""
+    labels = np.where(np.arange(14)[None] < np.asarray(sizes)[:, None], np.arange(len(sizes))[:, None], FREE)
+    labels[0, 13] = MISSING
+    return labels.astype(np.int8)
+
+
+def test_of_nine_segments_the_smallest_is_left_out_and_the_last_takes_its_number():
+    labels = stripes(SIZES)
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels), 9, CAPACITY))
+    np.testing.assert_array_equal(kept, np.where(labels == 2, OTHER, np.where(labels == 8, 2, labels)))
+    last = stripes([*SIZES[:8], 1])
+    kept = np.asarray(leave_out_smallest(jnp.asarray(last), 9, CAPACITY))
+    np.testing.assert_array_equal(kept, np.where(last == 8, OTHER, last))
+
+
+def test_of_fewer_segments_none_is_left_out():
+    labels = stripes([*SIZES[:4], 0, *SIZES[5:]])
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels), 9, CAPACITY))
+    np.testing.assert_array_equal(kept, np.where(labels == 8, 4, labels))
+
+
+SHELF = Shelf()
+COLUMNS = np.delete(np.arange(9 * 20), np.s_[60:75])
+INSTANCE = COLUMNS // 20
+# A row of points: nine things beside each other, of which the fourth is smallest.
+Y = SHELF.right + 0.03 + 0.08 * INSTANCE + 0.001 * (COLUMNS % 20)
+POINTS = np.stack([np.full(Y.shape, 0.6), Y, np.full(Y.shape, 0.5)], axis=-1)[None].astype(np.float32)
+
+
+def labels_of(monkeypatch, shelf, points, view=None):
+    """What the segmenter makes of a network that tells nine things apart by where they are."""
+
+    def network(_, parameters, cloud):
+        nearest = jnp.argmin(jnp.abs(cloud[0][:, None, 1] - jnp.asarray(Y)[None]), axis=1)
+        logits = jax.nn.one_hot(jnp.asarray(INSTANCE)[nearest], INSTANCES + 1)
+        return types.SimpleNamespace(logits=logits[None, None])
+
+    monkeypatch.setattr(networks, "apply_network", network)
+    nowhere = jnp.zeros(points.shape[:2], bool)
+    segmented = jax.jit(lambda points: NetworkSegmenter({}, None, view)(jax.random.key(0), shelf, points, nowhere))
+    return np.asarray(segmented(points))[0]
+
+
+def test_the_networks_nine_segments_become_eight(monkeypatch):
+    labels = labels_of(monkeypatch, SHELF, POINTS)
+    np.testing.assert_array_equal(labels, np.where(INSTANCE == 3, OTHER, np.where(INSTANCE == 8, 3, INSTANCE)))
+
+
+def test_the_network_sees_a_shelf_elsewhere_as_that_of_its_training(monkeypatch):
+    shift = (0.2, -0.1, 0.25)
+    usual = labels_of(monkeypatch, SHELF, POINTS, TrainedView())
+    elsewhere = SHELF.moved(shift), POINTS + np.float32(shift)
+    np.testing.assert_array_equal(labels_of(monkeypatch, *elsewhere, TrainedView()), usual)
+    assert (labels_of(monkeypatch, *elsewhere) != usual).any()

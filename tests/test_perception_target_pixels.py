@@ -14,7 +14,7 @@ from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import above_board
 from mechsearch_jax.images.colour import RED, TargetColour
-from mechsearch_jax.images.detection import coloured_pixels, elected, evened, near_target, without_phantoms
+from mechsearch_jax.images.detection import coloured_pixels, evened, near_target, without_phantoms
 from mechsearch_jax.images.labels import FREE, OTHER
 from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
@@ -71,12 +71,6 @@ def test_colours_are_evened_out_but_not_over_edges():
     alone = 0.02 * jnp.arange(30)[:, None] + 0.31 * jnp.arange(1, 31)[None, :]
     np.testing.assert_array_equal(evened(image, alone), image)
     np.testing.assert_array_equal(evened(image, jnp.full((30, 30), jnp.nan)), image)
-
-
-def test_most_of_the_neighbours_decide():
-    chosen = jnp.zeros((20, 20), bool).at[:, :10].set(True)
-    speckled = chosen.at[5, 3].set(False).at[12, 15].set(True)
-    np.testing.assert_array_equal(elected(speckled, jnp.full((20, 20), 0.5)), chosen)
 
 
 def test_a_segment_mostly_in_the_target_is_none():
@@ -172,8 +166,3 @@ def test_in_noise_no_object_is_recognised_in_a_target_of_another_red(noise):
     assert seen.target_visible
     centres = np.asarray(seen.objects.position)[np.asarray(seen.objects.valid)]
     assert not (np.asarray(distance(SETTING.target, Shelf(), seen.target_pose, jnp.asarray(centres))) < 0).any()
-
-
-def test_things_of_a_scene_are_not_in_each_other():
-    observation = Observation(superquadrics(SCENE.objects), jnp.array(True), jnp.array([*STANDING[:2], 0.0]))
-    assert overlap_faults(SETTING, observation) == ()

@@ -216,7 +216,8 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         config = dataclasses.replace(CONFIG, **changes)
         rollout = Rollout(problem, belief, config, evenly, seldom, POLICY.objective, counts)
         keys = jax.random.split(jax.random.key(0), 4000)
-        alive = jax.vmap(lambda key: rollout.act(first, root, key)[0]["alive"])(keys)
+        # Compiled, all else that an action comes with is left out.
+        alive = jax.jit(jax.vmap(lambda key: rollout.act(first, root, key)[0]["alive"]))(keys)
         return float(jnp.mean(alive))
 
     for as_in_paper, first, later in ((False, 4, 1), (True, 8, 8)):
@@ -385,7 +386,7 @@ def test_candidate_poses_do_not_count_once_a_target_is_found_that_stays(decision
     objects, pose = decision[0], (0.7, 0.2, 0.0)
     belief = look(problem, objects, True, pose)
     key = jax.random.key(3)
-    with_all = policies._plan(POLICY._planning, key, problem, belief, seen(objects, True, pose))
+    with_all = policies._plan(POLICY._planning, key, problem, belief, objects)
     alone = POLICY.planned(key, problem, belief, seen(objects, True, pose))
     jax.tree.map(np.testing.assert_array_equal, alone, with_all)
     # One that may be pushed is judged where it would then be.
@@ -426,9 +427,7 @@ def test_the_state_that_a_plan_begins_with_has_the_shapes_of_every_other(decisio
 def test_a_decision_is_the_same_in_the_blocks_of_a_gpu(decision, problem, monkeypatch):
     objects, belief, plan = decision
     monkeypatch.setattr(masked, "on_cpu", lambda: False)
-    again = jax.jit(lambda key: policies._plan.__wrapped__(POLICY, key, problem, belief, seen(objects)))(
-        jax.random.key(0)
-    )
+    again = jax.jit(lambda key: policies._plan.__wrapped__(POLICY, key, problem, belief, objects))(jax.random.key(0))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plan, again)
 
 
@@ -566,24 +565,12 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
         ({"actions": ()}, "one or more kinds of action"),
+        ({"trials": "guess"}, 'trials "guess" is unknown; use none, physics'),
     ],
 )
 def test_impossible_options_are_refused_with_what_would_do(changes, message):
     with pytest.raises(InputError, match=message):
         planner.standard(**changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
-        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
-        ({"crowding_weight": float("nan")}, "crowding_weight nan"),
-    ],
-)
-def test_what_is_no_option_is_checked_too(changes, message):
-    with pytest.raises(InputError, match=message):
-        PlannerConfig(**changes)
 
 
 @pytest.mark.parametrize(
@@ -637,15 +624,6 @@ def test_a_random_policy_is_indifferent_and_its_actions_are_possible(decision, p
     assert len({(int(one.action.kind), int(one.action.object)) for one in chosen}) > 3
 
 
-def test_a_greedy_policy_looks_one_action_ahead_and_minds_nothing_but_the_area():
-    policy = planner.greedy(planner.standard(horizon=3, sequences=40).planner)
-    assert isinstance(policy.objective, type(planner.search_and_grasp().objective))
-    config = policy.config
-    assert (config.horizon, config.sequences, config.guided_fraction) == (1, 40, 0.0)
-    assert (config.crowding_weight, config.unseen_contact_penalty) == (0.0, 0.0)
-    assert planner.policy_factory("greedy") is planner.greedy
-
-
 @pytest.mark.slow
 def test_a_greedy_policy_leaves_the_least_of_f(decision, problem):
     objects, belief, _ = decision
@@ -670,16 +648,6 @@ def test_the_papers_preset_draws_until_an_action_is_possible_and_moves_objects_a
     moved = np.asarray(decided.sequences.actions.object)
     assert any(len(set(o[:n])) < n for o, n in zip(moved, lengths, strict=True))
     assert float(decided.value) < 0
-
-
-@pytest.mark.slow
-def test_a_decision_with_pushes_predicted_by_geometry_is_one_too(decision, problem):
-    objects, belief, learned = decision
-    geometric = planner.search_for_grasp(push_model=QuasiStatic())
-    plan = geometric(jax.random.key(0), problem, belief, seen(objects))
-    assert float(plan.value) < 0
-    assert float(plan.predicted_cost) < float(plan.cost) == float(learned.cost)
-    assert not np.array_equal(np.asarray(plan.sequences.cost), np.asarray(learned.sequences.cost))
 
 
 @pytest.mark.slow

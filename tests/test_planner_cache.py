@@ -67,23 +67,6 @@ def test_a_damaged_file_is_built_anew(folder, problem, monkeypatch, damage):
     assert_same(cache.cached_problem(), problem)
 
 
-def test_without_a_folder_problems_are_built(tmp_path, problem, monkeypatch):
-    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
-    monkeypatch.setenv(kept_arrays.VARIABLE, "")
-    assert cache.cached_problem() is problem
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv(kept_arrays.VARIABLE, str(tmp_path / "file"))
-    assert cache.cached_problem() is problem
-
-
-def test_only_a_few_problems_are_kept(folder, problem, monkeypatch):
-    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
-    for version in range(cache.CACHED_PROBLEMS + 2):
-        monkeypatch.setattr(cache, "_source", lambda version=version: str(version))
-        cache.cached_problem()
-    assert len(list(folder.glob("problem-*"))) == cache.CACHED_PROBLEMS
-
-
 def test_a_file_that_another_process_deletes_meanwhile_is_no_error(tmp_path):
     for name in ("first", "second"):
         (tmp_path / f"problem-{name}.npz").write_bytes(b"")

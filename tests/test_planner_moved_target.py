@@ -13,15 +13,11 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.belief.belief import possible_poses, with_target
-from mechsearch_jax.belief.moved_target import BEYOND, beyond_candidates, candidate_of, nearest_candidate
+from mechsearch_jax.belief.moved_target import candidate_of
 from mechsearch_jax.config.config import Weights
-from mechsearch_jax.geometry.superquadric import empty
-from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.grasping.graspability import INFEASIBLE, crowding, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.shapes.compound import Piece
 from mechsearch_jax.workspace import scenario
-from mechsearch_jax.workspace.target import Target
 
 POLICY = planner.search_for_grasp(move_target=True)
 POSE = (0.469, -0.058, 0.0)
@@ -102,14 +98,6 @@ def test_only_the_place_of_a_found_target_counts(problem, belief):
         assert np.flatnonzero(possible_poses(given, exists, where)).tolist() == list(expected)
 
 
-def test_positions_far_from_the_candidates_are_known(problem):
-    low, high = np.asarray(problem.poses)[[0, -1], :2]
-    cell = BEYOND * np.array(problem.target.cell(problem.shelf)[:2])
-    places = np.array([low - 0.9 * cell, high + 0.9 * cell, low - 1.1 * cell, high + 1.1 * cell])
-    points = jnp.float32(np.column_stack([places, np.full(4, 0.45)]))
-    assert beyond_candidates(problem, points).tolist() == [False, False, True, True]
-
-
 def test_the_cost_of_a_pushed_target_is_that_of_its_candidate(problem, objects, states):
     _, after, cost = states
     pose = int(np.argmax(after.target_at))
@@ -143,12 +131,6 @@ def test_the_target_may_be_pushed_once_but_not_picked(states):
     assert not after.available[8]
 
 
-def test_without_the_option_the_target_stays(problem, belief, objects):
-    fixed = planner.search_for_grasp(move_target=False)
-    root = rollout_of(problem, belief, fixed).root(objects)
-    assert root.available.tolist() == [True] * 3 + [False] * 6
-
-
 @pytest.mark.slow
 def test_a_found_target_is_pushed_where_that_frees_it(objects):
     # From farther to the side it is grasped past the box.
@@ -166,37 +148,3 @@ def test_a_found_target_is_pushed_where_that_frees_it(objects):
     freed = np.asarray(decision.sequences.cost)[of_target[:, 0] & (kind[:, 0] == ActionKind.PUSH), 0]
     assert freed.min() < float(decision.cost) - 0.5
     assert set(kind[of_target].tolist()) <= {ActionKind.PUSH, ActionKind.NONE}
-
-
-def test_a_target_that_is_not_found_is_not_there_to_be_pushed(problem, objects):
-    root = rollout_of(problem, planner.initial_belief(problem)).root(objects)
-    assert root.available.tolist() == [True] * 3 + [False] * 6
-
-
-def test_a_target_of_pieces_counts_by_its_own_pose(problem, belief):
-    """Among objects without parts its slot holds its largest part, which is beside its centre of mass."""
-    block = Piece("box", (0.03, 0.03, 0.03), (0.1, 0.0, 0.0))
-    target = Target.from_parts((block, Piece("box", (0.07, 0.01, 0.01))))
-    problem = problem.replace(target=target)
-
-    @jax.jit
-    def slot(pose):
-        T = upright_pose(pose, target.height(problem.shelf))
-        found = belief.replace(grasps=belief.grasps.replace(T_world_target=T))
-        scene, is_target = with_target(problem, found, empty(8))
-        return scene, is_target, candidate_of(problem, scene, is_target)
-
-    rng = np.random.default_rng(0)
-    poses = np.column_stack([rng.uniform((0.5, -0.2), (0.7, 0.2), (20, 2)), rng.uniform(-np.pi, np.pi, 20)])
-    beside = 0
-    for pose in poses.astype(np.float32):
-        scene, is_target, candidates = jax.device_get(slot(pose))
-        assert scene.parts is None
-        np.testing.assert_allclose(scene.size[is_target][0], block.half_size, rtol=1e-5)
-        expected, of_part = (
-            int(nearest_candidate(problem.poses, jnp.float32([*place, pose[2]]), target.turn))
-            for place in (pose[:2], scene.position[is_target][0, :2])
-        )
-        assert np.flatnonzero(candidates).tolist() == [expected]
-        beside += expected != of_part
-    assert beside > 10

@@ -1,28 +1,30 @@
-"""The configuration file: what it gives, what it leaves alone, and how it refuses what is wrong."""
+"""Configuration files: what they say, what goes before them, and what is wrong in them."""
 
 import dataclasses
 import math
+import os
 import re
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.episode.episodes import target_of
+from mechsearch_jax.envs.cell import loading as cell
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.trials.named import named_trials
 from mechsearch_jax.images.colour import TargetColour
-from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.problem import settings
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.runtime import errors, tables
+from mechsearch_jax.runtime import tables
+from mechsearch_jax.runtime.compiled import _KEEPING
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.scenario import load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -43,17 +45,6 @@ def test_the_example_holds_every_key_with_its_default(tmp_path):
     loaded = load_settings(tmp_path / "all.toml")
     assert dataclasses.replace(loaded, given={}) == Settings()
     assert loaded.config == Settings().config == PRESETS["standard"]()
-
-
-def test_the_example_of_the_guide_is_read(tmp_path):
-    guide = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
-    block, _ = re.findall(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
-    assert load(tmp_path, block).config == PRESETS["paper"](gamma=0.8)
-    assert all(f"| `[{name}]` |" in guide for name in settings.tables())
-
-
-def test_every_option_of_the_planner_is_a_key():
-    assert set(settings.tables()["planner"]) == {"preset", *(option.name for option in OPTIONS)}
 
 
 def test_what_is_given_goes_where_it_belongs(tmp_path):
@@ -213,55 +204,6 @@ def test_the_command_line_goes_before_the_file(tmp_path):
     assert given.settings().config == PRESETS["standard"](gamma=0.7, **{**standard, "push_directions": (0.0,)})
 
 
-@pytest.mark.parametrize(
-    "command", ["search first-light", "inspect first-light", "evaluate first-light", "bench existence", "bench plan"]
-)
-def test_every_command_that_builds_a_problem_takes_it(tmp_path, command, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.toml").write_text("[camera]\nwidht = 3\n")
-    monkeypatch.setattr("sys.argv", ["mechsearch", *command.split(), "--out", "out", "--config", "mine.toml"])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 2
-    assert "mine.toml:2: [camera] widht is unknown; did you mean width?" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
-
-
-def test_a_workcell_tells_methods_apart():
-    usual = Method()
-    cell = Workcell(shelf=Shelf(back=0.8), camera=Camera(position=(0.0, 0.4, 0.7)))
-    method = dataclasses.replace(usual, workcell=cell)
-    assert set(method.options()) - set(usual.options()) == {"workcell.shelf.back", "workcell.camera.position"}
-
-
-def test_the_nearest_name_is_offered():
-    assert errors.nearest("widht", ["height", "width"]) == "did you mean width?"
-    assert errors.nearest("zzz", ["height", "width"]) == "known are height, width"
-
-
-@pytest.mark.slow
-def test_scenes_are_generated_in_the_shelf_and_of_the_sizes_that_are_given(tmp_path, monkeypatch):
-    text = """
-[shelf]
-back = 0.75
-left = 0.4
-[objects]
-boxes = [[0.1, 0.06, 0.14]]
-cylinders = []
-[target]
-half_size = [0.018, 0.018, 0.045]
-"""
-    (tmp_path / "mine.toml").write_text(text)
-    monkeypatch.chdir(tmp_path)
-    cli.parse(["scenarios", "generate", "--objects", "3", "--config", "mine.toml", "--out", "new"])()
-    (file,) = (tmp_path / "new").iterdir()
-    scene = load_scenario(file, load_settings(tmp_path / "mine.toml").workcell.shelf)
-    assert {tuple(sorted(body.half_size)) for body in scene.objects} == {(0.03, 0.05, 0.07)}
-    assert scene.target.half_size == (0.018, 0.018, 0.045)
-    assert all(body.position[0] < 0.75 and body.position[1] < 0.4 for body in (*scene.objects, scene.target))
-    assert target_of(scene, load_settings(tmp_path / "mine.toml").workcell.target).half_size == (0.018, 0.018, 0.045)
-
-
 PIECES = """[target]
 pieces = [
  {shape = "box", half_size = [0.015, 0.05, 0.012], position = [0, 0, 0.012], quaternion = [1, 0, 0, 0]},
@@ -295,3 +237,64 @@ def test_a_target_of_pieces_or_of_a_mesh(tmp_path):
 def test_a_wrong_target_of_pieces_is_refused(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         load(tmp_path, f"[target]\n{text}")
+
+
+FILE = """
+[camera]
+width = 848
+height = 480
+fx = 404.0
+fy = 404.0
+cx = 424.0
+cy = 240.0
+
+[planner]
+gamma = 0.8
+max_steps = 3
+push_model = "quasi-static"
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(FILE)
+    return path
+
+
+def test_a_file_says_workcell_and_planner(file):
+    settings = load_settings(file)
+    searcher = cell.load_searcher(file, keep=False)
+    assert searcher.workcell == settings.workcell
+    # A robot touches nothing beside what is to be moved, unless the file says that it may.
+    config = settings.config.with_options(retrieval_contact=False)
+    assert searcher.config == config
+    assert cell.load_searcher(file, keep=False, retrieval_contact=True).config == settings.config
+    expected = Method(config=config, workcell=settings.workcell).policy()
+    policy = searcher._policy
+    assert policy.config == expected.config
+    assert policy.tries
+    assert expected.tries
+    assert searcher._trials == named_trials("physics")
+    assert (policy.predict, policy.objective, policy.plan) == (expected.predict, expected.objective, expected.plan)
+
+
+def test_what_is_given_goes_before_the_file(file):
+    camera = example_images().camera
+    searcher = cell.load_searcher(file, camera=camera, keep=False, trials="none", max_steps=7, seed=3)
+    assert searcher.workcell.camera == camera
+    assert (searcher.config.max_steps, searcher.config.planner.gamma) == (7, 0.8)
+    assert (searcher._policy.tries, searcher._trials) == (False, None)
+    with pytest.raises(InputError, match="option speed is unknown"):
+        cell.load_searcher(file, keep=False, speed=1.0)
+
+
+def test_without_a_file_all_is_as_by_default():
+    assert cell.load_searcher(keep=False).config == Settings().config.with_options(retrieval_contact=False)
+
+
+def test_compilations_are_kept(file, tmp_path, monkeypatch):
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(tmp_path)))
+    cell.load_searcher(file)
+    assert _KEEPING.executables.folder == tmp_path / "cache" / "executables"

@@ -7,24 +7,21 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from mechsearch_jax.actions import KINDS, no_action
+from mechsearch_jax.actions import no_action
 from mechsearch_jax.belief.belief import graspability_map, initial_belief, update_belief
 from mechsearch_jax.commands.search import _expected
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
 from mechsearch_jax.envs.episode import verdicts
 from mechsearch_jax.envs.recording import evidence
-from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.bodies import PARTS
 from mechsearch_jax.grasping.retrieval import top_grasps
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.planner.rollout import begin, shapes_of_parts
-from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.session import preparing
-from mechsearch_jax.session.preparing import Preparing, Program, first_decision, motions, prepare, prepared
+from mechsearch_jax.session.preparing import Preparing, Program, prepared
 from mechsearch_jax.shapes.compound import Piece
-from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
+from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -42,33 +39,6 @@ def test_what_is_compiled_is_named_with_how_many_are_left():
     assert lines[2:] == ["compiling; 2 of 2 done"]
 
 
-def test_programs_are_lowered_in_order_and_compiled_at_the_same_time():
-    order, both = [], threading.Barrier(2, timeout=60)
-
-    def begin(name):
-        order.append(name)
-        return both.wait
-
-    prepare([Program(name, lambda: False, lambda name=name: begin(name)) for name in ("a", "b")], lambda line: None)
-    assert order == ["a", "b"]
-    assert not both.broken
-
-
-def test_nothing_is_said_where_everything_is_there():
-    lines, prepared_ones = [], []
-    with prepared([program("a", True, lambda: prepared_ones.append("a"))], lines.append):
-        pass
-    assert lines == []
-    assert prepared_ones == ["a"]
-
-
-def test_the_block_runs_meanwhile():
-    both = threading.Barrier(2, timeout=20)
-    with prepared([program("a", prepare=both.wait)], lambda line: None):
-        both.wait()
-    assert not both.broken
-
-
 def test_what_is_added_later_is_reported_with_what_is_left():
     lines, first = [], threading.Event()
     with Preparing(lines.append) as preparing:
@@ -77,14 +47,6 @@ def test_what_is_added_later_is_reported_with_what_is_left():
         first.set()
     assert lines[:2] == ["compiling: a; 0 of 1 done", "compiling: a, c; 0 of 2 done"]
     assert lines[-1] == "compiling; 2 of 2 done"
-
-
-def test_what_is_optional_is_prepared_without_a_word():
-    lines, begun = [], threading.Event()
-    with Preparing(lines.append) as preparing:
-        preparing.add([program("a", prepare=begun.set)], optional=True)
-        assert begun.wait(20)
-    assert lines == []
 
 
 def test_the_end_of_the_block_neither_begins_nor_waits_for_what_is_optional(monkeypatch):
@@ -108,13 +70,6 @@ def test_the_end_of_the_block_neither_begins_nor_waits_for_what_is_optional(monk
     assert begun == ["a", "b"]
 
 
-def test_what_is_needed_is_waited_for_at_the_end():
-    done = []
-    with Preparing(lambda line: None) as preparing:
-        preparing.add([program("a", prepare=lambda: (time.sleep(0.2), done.append("a")))])
-    assert done == ["a"]
-
-
 def test_what_is_wrong_is_said_by_who_calls_it():
     def fail():
         raise ValueError("cannot be compiled")
@@ -123,20 +78,6 @@ def test_what_is_wrong_is_said_by_who_calls_it():
     with prepared([program("a", prepare=fail)], lines.append):
         pass
     assert lines == ["compiling: a; 0 of 1 done"]
-
-
-def test_an_error_in_the_block_is_the_blocks_own():
-    with pytest.raises(KeyError), prepared([program("a")], lambda line: None):
-        raise KeyError("b")
-
-
-def test_a_policy_of_a_users_own_is_compiled_when_it_is_called(problem):
-    def names(policy):
-        return [program.name for program in first_decision(problem, policy, MotionConfig())]
-
-    others = ["belief", *(f"motion of {kind.name}" for kind in KINDS.values())]
-    assert names(lambda *_: None) == others
-    assert names(search_for_grasp()) == ["plan"] * 5 + others
 
 
 MUG = Target.from_parts((Piece("cylinder", (0.03, 0.03, 0.05)), Piece("box", (0.02, 0.005, 0.03), (0.04, 0.0, 0.0))))
@@ -247,12 +188,3 @@ def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):
         assert begun == ["a", "b", "c"]
         first.set()
     assert begun == ["a", "b", "c", "d"]
-
-
-@pytest.mark.parametrize("config", [None, SimulatorConfig(motion=MotionConfig(waypoints=9))])
-def test_a_native_simulator_knows_the_motions_that_it_computes(config):
-    world = from_scenario(load_scenario(example_scenarios()["first-light"]))
-    programs = NativeSimulator(config=config).programs(world)
-    expected = motions((config or SimulatorConfig()).motion)
-    assert [program.name for program in programs] == [program.name for program in expected]
-    assert all(a.is_ready() == b.is_ready() for a, b in zip(programs, expected, strict=True))

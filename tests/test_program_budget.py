@@ -8,14 +8,12 @@ import collections
 import math
 
 import jax
-import jax.numpy as jnp
 import pytest
 
 import mechsearch_jax as ms
 from mechsearch_jax.belief.belief import without_candidates, without_grasps
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.bodies import PARTS
-from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import policies
 from mechsearch_jax.shapes.compound import Piece
 from mechsearch_jax.workspace.target import Target
@@ -65,8 +63,8 @@ def primitives(program):
 def decision(problem, belief, parts=None):
     """The program of a decision for a belief, with room for so many parts of each body."""
     settings = ms.search_for_grasp()
-    seen = Observation(objects=superquadric.empty(8, parts), target_visible=jnp.array(False), target_pose=jnp.zeros(3))
-    plan = lambda key, problem, belief: policies._plan.__wrapped__(settings, key, problem, belief, seen)  # noqa: E731
+    objects = superquadric.empty(8, parts)
+    plan = lambda key, problem, belief: policies._plan.__wrapped__(settings, key, problem, belief, objects)  # noqa: E731
     return jax.make_jaxpr(plan)(jax.random.key(0), problem, belief).jaxpr
 
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.arm_config import PANDA
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.runtime.errors import InputError
 
 inverse = jax.jit(kinematics.inverse_kinematics)
 forward = jax.jit(kinematics.gripper_pose)
@@ -177,8 +176,3 @@ def test_unreachable_line_is_flagged_and_finite():
     q, reachable = kinematics.line_kinematics(T, jnp.float32(0.3), jnp.float32(0.8), 4)
     assert not reachable
     assert np.isfinite(q).all()
-
-
-def test_a_line_needs_two_waypoints():
-    with pytest.raises(InputError, match="at least 2"):
-        kinematics.line_poses(jnp.eye(4), jnp.float32(0.3), 1)

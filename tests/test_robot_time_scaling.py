@@ -255,17 +255,3 @@ def test_a_still_stretch_takes_no_time_and_has_gradients():
     assert float(seconds) < 2 * PLAN.timestep
     np.testing.assert_allclose(angles, np.tile(HOME, (50, 1)), atol=1e-6)
     assert np.isfinite(pullback((jnp.float32(1.0), jnp.ones((50, 7))))[0]).all()
-
-
-def test_few_waypoints_are_enough():
-    ends = jnp.stack([jnp.asarray(HOME), jnp.asarray(HOME) + 0.3])
-    schedule = jax.jit(motion._schedule, static_argnums=(1, 2))
-    straight, _ = schedule(ends, (motion._Stretch(500, 0, 1, (0.0, 0.0)),), PLAN.timestep)
-    share = (straight.q - HOME[None]) / 0.3
-    np.testing.assert_allclose(share, jnp.tile(share[:, :1], 7), atol=1e-5)
-    # Beside a stretch with more, it is the same.
-    more = jnp.concatenate([ends, jnp.linspace(ends[1], ends[1] - 0.2, 8)[1:]])
-    stretches = (motion._Stretch(500, 0, 1, (0.0, 0.0)), motion._Stretch(500, 1, 8, (0.0, 0.0)))
-    both, _ = schedule(more, stretches, PLAN.timestep)
-    steps = int(straight.length)
-    np.testing.assert_allclose(both.q[:steps], straight.q[:steps], atol=1e-5)

@@ -47,7 +47,6 @@ from mechsearch_jax.session import searcher as searcher_module
 from mechsearch_jax.session.faults import check_image, recognition_warnings
 from mechsearch_jax.session.images import converted
 from mechsearch_jax.session.searcher import Searcher
-from mechsearch_jax.session.state import beginning
 from mechsearch_jax.session.step import Motion
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
@@ -57,7 +56,6 @@ from mechsearch_jax.workspace.target import Target
 
 IMAGES = example_images()
 CAMERA, SHELF = IMAGES.camera, Shelf()
-FLIP = np.diag([1.0, -1.0, -1.0])
 # The images are of another scene than what is recognised here.
 TRUSTING = TrajectoryConfig(doubt=DoubtConfig(missing=1.0, unexplained=1.0, passed=1.0))
 
@@ -79,10 +77,6 @@ def searcher_of(problem, scenario, policy=grab, **arguments):
 def now(searcher):
     """What a searcher knows."""
     return SearchState(searcher.belief, searcher._now.observation, searcher._now.action)
-
-
-def turned(camera, by):
-    return dataclasses.replace(camera, rotation=tuple(map(tuple, (np.array(camera.rotation) @ by).tolist())))
 
 
 def moved(camera, by):
@@ -206,25 +200,7 @@ def uncalled(problem):
     return recognise
 
 
-def placement_of(camera, calibration=None):
-    """What is said of the example's depth where it is taken by a camera."""
-    setting = types.SimpleNamespace(camera=camera, shelf=SHELF, target=Target())
-    images = converted(IMAGES.depth, IMAGES.colour, None, None)
-    return check_image(setting, calibration or CalibrationLimits(), images)[1]
-
-
 LAX = CalibrationLimits(refuse_shift=0.03)
-
-
-def test_where_the_shelf_is_not_in_its_place_a_look_says_so_by_the_limits_of_the_cell():
-    assert placement_of(CAMERA) == []
-    (fault,) = placement_of(moved(CAMERA, (0.005, 0.0, 0.0)))
-    assert "the shelf is up to 5 mm" in fault
-    far = moved(CAMERA, (0.02, 0.0, 0.0))
-    with pytest.raises(InputError, match=r"the shelf is up to 20 mm .* too far to go on"):
-        placement_of(far)
-    fault, *_ = placement_of(far, LAX)
-    assert "the shelf is up to 20 mm" in fault
 
 
 def test_a_shelf_out_of_its_place_is_a_warning_of_a_step_and_is_refused_before_recognition(problem):
@@ -319,15 +295,6 @@ def test_what_a_configuration_names_is_what_decides_by_default():
     # A policy tries what it proposes; a user's may do without.
     assert Searcher(policy=search_for_grasp(tries=True))._trials == method.trials()
     assert Searcher(policy=search_for_grasp())._trials is Searcher(policy=idle)._trials is None
-
-
-def test_what_a_configuration_names_and_a_slot_holds_decides():
-    simulated = NativeTrials()
-    searcher = Searcher(config=standard(gamma=0.5, push_model="quasi-static"), trials=simulated)
-    assert searcher._trials is simulated
-    assert searcher._policy.tries
-    assert searcher._policy.config.gamma == 0.5
-    assert searcher._policy.predict.push_model is own_push_model("quasi-static")
 
 
 def test_where_nothing_is_tried_out_it_says_so(problem):
@@ -429,13 +396,6 @@ def test_images_of_any_type_are_made_alike(colour):
     np.testing.assert_array_equal(mask, IMAGES.mask)
 
 
-def test_images_that_are_wrong_stay_wrong():
-    depth, colour, mask, _ = converted(
-        np.ones((2, 2), np.uint16), np.full((2, 2, 3), 255.0), np.full((2, 2), 2**40), None
-    )
-    assert (depth.dtype, colour.max(), mask.min() > 8) == (np.uint16, 255.0, True)
-
-
 def one_push(problem):
     """A plan of one push that the arm can make, which compiles in no time."""
     grasps = problem.grasps
@@ -532,19 +492,6 @@ def test_a_saved_search_goes_on_where_it_was(problem, tmp_path):
     assert third.finished
 
 
-def test_a_search_that_was_saved_before_objects_said_how_sure_they_are_goes_on(problem, tmp_path):
-    path, new, old = tmp_path / "search.npz", searcher_of(problem, OPEN), searcher_of(problem, OPEN)
-    new._state = dataclasses.replace(beginning(problem), observation=seen(OPEN), index=3)
-    new.save(path)
-    with np.load(path) as file:
-        arrays = {name: file[name] for name in file if name != "['observation'].confidence"}
-        assert len(arrays) == len(file.files) - 1
-    np.savez(path, **arrays)
-    old.load(path)
-    assert old._now.index == 3
-    jax.tree.map(np.testing.assert_array_equal, old._now.observation, seen(OPEN))
-
-
 def test_a_saved_search_goes_on_with_another_hand_and_place(problem, tmp_path):
     path = tmp_path / "search.npz"
     searcher_of(problem, OPEN).save(path)
@@ -598,42 +545,6 @@ def test_what_is_in_reach_is_known_before_the_first_image(problem):
 def test_the_example_images_fit_their_camera():
     assert camera_faults(CAMERA, SHELF) == ()
     assert image_faults(Look(CAMERA, SHELF, IMAGES.depth, mask=IMAGES.mask)) == ()
-
-
-@pytest.mark.parametrize(
-    ("camera", "words"),
-    [
-        (turned(CAMERA, FLIP), "looks away from the shelf"),
-        (dataclasses.replace(CAMERA, fx=6000.0, fy=6000.0), "% of the board only"),
-    ],
-)
-def test_a_wrong_camera_is_reported(camera, words):
-    (fault,) = camera_faults(camera, SHELF)
-    assert words in fault
-
-
-@pytest.mark.parametrize(
-    ("camera", "words"),
-    [
-        (moved(CAMERA, (0.0, 0.0, 0.02)), "2.0 cm too high"),
-        (moved(CAMERA, (0.0, 0.0, -0.03)), "3.0 cm too low"),
-        (moved(CAMERA, (0.0, 0.0, 0.12)), "shows no board"),
-    ],
-)
-def test_a_board_elsewhere_is_reported(camera, words):
-    (fault,) = image_faults(Look(camera, SHELF, IMAGES.depth))
-    assert words in fault
-
-
-def test_a_board_5_mm_off_is_not():
-    assert image_faults(Look(moved(CAMERA, (0.0, 0.0, 0.005)), SHELF, IMAGES.depth)) == ()
-
-
-def test_images_that_show_nothing_are_reported():
-    with pytest.raises(InputError, match="nothing was measured"):
-        image_faults(Look(CAMERA, SHELF, np.zeros_like(IMAGES.depth)))
-    (fault,) = image_faults(Look(CAMERA, SHELF, IMAGES.depth, mask=np.full_like(IMAGES.mask, -1)))
-    assert "names no object" in fault
 
 
 def described(e1, e2, half=(0.03, 0.03, 0.06)):

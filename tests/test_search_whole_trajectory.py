@@ -27,7 +27,7 @@ from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
 from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME, forward_kinematics
 from mechsearch_jax.robot.motion import MotionConfig
-from mechsearch_jax.robot.robot_trajectory import Bounds, Part
+from mechsearch_jax.robot.robot_trajectory import Part
 from mechsearch_jax.robot.trajectory_files import csv_header, save_csv, save_ros
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.step import touches
@@ -373,14 +373,6 @@ def test_what_does_not_explain_the_image_is_refused(spoil, depth_of, message):
 def test_a_depth_image_of_another_size_is_refused():
     with pytest.raises(InputError, match="depth image: its shape"):
         pushed(depth=np.ones((4, 5)))
-
-
-@pytest.mark.parametrize("changes", [{"tracking": 0.0}, {"force": -1.0}, {"effort": (1.0, 2.0)}])
-def test_impossible_bounds_are_refused(changes):
-    with pytest.raises(InputError, match="Bounds"):
-        Bounds(**changes)
-    with pytest.raises(InputError, match="DoubtConfig"):
-        DoubtConfig(passed=2.0)
 
 
 def test_a_csv_file_holds_it(tmp_path):

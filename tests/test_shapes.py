@@ -26,7 +26,7 @@ from mechsearch_jax.images.target_pose import target_poses
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.shapes import SHAPES, Shape, by_shape, in_order, shape_of
+from mechsearch_jax.shapes import SHAPES, Shape
 from mechsearch_jax.shapes.primitives import Cylinder
 from mechsearch_jax.viz.drawing import draw_target
 from mechsearch_jax.workspace.camera import Camera
@@ -141,23 +141,6 @@ def surface(shape, half, count=20_000):
     areas = np.asarray(shape.areas(half, np))
     part = rng.choice(3, count, p=areas / areas.sum())
     return shape.spread(part, rng.uniform(-1, 1, (count, 3)), rng.choice([-1.0, 1.0], count), np) * half
-
-
-def test_codes_number_the_shapes_from_0_and_names_find_them():
-    assert [shape.code for shape in in_order()] == list(range(len(SHAPES)))
-    assert all(SHAPES[shape.name] is shape and shape_of(shape.name) is shape for shape in SHAPES.values())
-    names = " or ".join(f'"{name}"' for name in SHAPES)
-    for unknown in ("sphere", None, ["box"]):
-        with pytest.raises(InputError, match=f"^it: .* is unknown; use {names}$"):
-            shape_of(unknown, "it")
-
-
-@pytest.mark.parametrize("library", [np, jnp])
-def test_each_body_has_its_own_shape(library):
-    kind = library.asarray([[1, 0], [0, 1]])
-    values = by_shape(kind[..., None], lambda shape: library.asarray([shape.code, shape.density]), library)
-    expected = [[[shape.code, shape.density] for shape in row] for row in ([*reversed(in_order())], in_order())]
-    np.testing.assert_allclose(values, expected)
 
 
 def test_half_extents_that_are_nearest_are_of_the_shape_and_keep_its_volume(shape, half):
@@ -318,25 +301,6 @@ def test_float32_is_close(shape, half):
         np.testing.assert_allclose(values, getattr(shape, name)(first, second, np), rtol=1e-4, err_msg=name)
     values = shape.distance(jnp.float32(points[:, :2]), jnp.float32(points[:, 2]), tuple(half.tolist()), jnp)
     np.testing.assert_allclose(values, distance(shape, points, half), atol=1e-6)
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_every_shape_has_a_target_that_the_gripper_takes(name):
-    target = Target.of(name)
-    assert target.yaws == 1 or not shape_of(name).round
-    T = graspability._target_grasps(target, Gripper(), GraspConfig()).T_target_gripper
-    assert len(T) > 0
-    assert Target() == Target.cylinder() == Target.of("cylinder")
-    assert Target.box() == Target.of("box")
-
-
-def test_half_extents_of_another_shape_are_refused():
-    with pytest.raises(InputError, match="a cylinder's first two are its radius"):
-        Target(half_size=(0.02, 0.03, 0.05))
-    with pytest.raises(InputError, match='Target: shape: "can" is unknown; use "box" or "cylinder"'):
-        Target(shape="can")
-    with pytest.raises(InputError, match="unknown"):
-        world.from_scenario(Scenario("odd", (), Body("can", (0.02, 0.02, 0.05), (0.6, 0.1, 0.5), UPRIGHT)))
 
 
 @pytest.fixture

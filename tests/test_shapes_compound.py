@@ -12,8 +12,8 @@ from mechsearch_jax.runtime import kept_arrays
 from mechsearch_jax.runtime.errors import InputError, Note
 from mechsearch_jax.shapes import PRIMITIVES, meshes, surfaces
 from mechsearch_jax.shapes import compound as compounds
-from mechsearch_jax.shapes.compound import COMPOUND, CONVEX, Compound, Piece, centred, inertial, solids
-from mechsearch_jax.shapes.meshes import convex_pieces, joined, thinned
+from mechsearch_jax.shapes.compound import CONVEX, Compound, Piece, inertial, solids
+from mechsearch_jax.shapes.meshes import convex_pieces, joined
 from mechsearch_jax.shapes.parts import PARTS, parts_of, volume_in_common
 from mechsearch_jax.shapes.surfaces import mended
 
@@ -38,11 +38,6 @@ def even(seed, half, count=200_000, stretch=1.1):
     """Uniform points in the box around a primitive, a little larger, and the box's volume."""
     bound = stretch * np.array(half)
     return np.random.default_rng(seed).uniform(-bound, bound, (count, 3)), float(np.prod(2 * bound))
-
-
-def test_the_codes_of_primitives_are_their_order():
-    assert [primitive.code for primitive in PRIMITIVES.values()] == list(range(len(PRIMITIVES)))
-    assert len(PRIMITIVES) == compounds.CONVEX_CODE
 
 
 @pytest.mark.parametrize("name", PRIMITIVES)
@@ -91,12 +86,6 @@ def test_meshes_of_primitives_have_their_volume(name):
     np.testing.assert_allclose(mesh.bounds, [-np.array(half), half], atol=0.02 * max(half))
 
 
-def test_what_a_capsule_cannot_be_is_said():
-    assert "equal" in PRIMITIVES["capsule"].fault((0.02, 0.03, 0.05))
-    assert "at least its radius" in PRIMITIVES["capsule"].fault((0.03, 0.03, 0.02))
-    assert all(PRIMITIVES[name].fault(half) is None for name, half in HALF.items())
-
-
 @pytest.mark.parametrize("ends", [(0.03, 0.05), (0.05, 0.01), (0.03, 0.03)])
 def test_a_frustum_is_a_stack_of_discs_of_its_volume(ends):
     low, high = ends
@@ -135,14 +124,6 @@ def test_a_polyhedron_weighs_what_the_box_of_its_corners_weighs():
     np.testing.assert_array_equal(*(compounds.inside(piece, points + piece.position) for piece in (polyhedron, box)))
 
 
-def test_a_centred_compound_stays_as_it_is():
-    moved, centre = centred(MUG)
-    assert centre[2] == pytest.approx(0.05)
-    np.testing.assert_allclose(inertial(moved).centre, 0.0, atol=1e-7)
-    assert centred(moved)[0] is moved
-    np.testing.assert_allclose(inertial(moved).moments, inertial(MUG).moments, rtol=1e-5)
-
-
 def test_all_of_a_compound_is_in_the_hull_of_its_surface_points():
     pieces = tuple(Piece(name, half, (0.05 * i, 0.02 * i, 0.0), TILTED) for i, (name, half) in enumerate(HALF.items()))
     body = Compound((*pieces, Piece("frustum", (0.03, 0.05, 0.04), (0.0, 0.1, 0.0), TILTED)), 500.0, 0.5)
@@ -177,14 +158,6 @@ def test_parts_are_the_pieces_superquadrics():
     (smooth,) = parts_of(Compound((Piece("ellipsoid", HALF["ellipsoid"]),), 500.0, 0.5))
     assert smooth.exponents == (1.0, 1.0)
     assert volume_in_common(Compound((Piece("capsule", (0.02, 0.02, 0.06)),), 500.0, 0.5)) > 0.9
-
-
-def test_too_many_pieces_become_four_parts():
-    row = tuple(Piece("box", (0.01, 0.02, 0.03), (0.02 * i, 0.0, 0.0)) for i in range(6))
-    other = tuple(Piece("cylinder", (0.02, 0.02, 0.01), (0.3, 0.0, 0.02 * i)) for i in range(3))
-    body = Compound((*row, *other), 500.0, 0.5)
-    assert len(parts_of(body)) == PARTS
-    assert volume_in_common(body) > 0.9
 
 
 def test_a_mesh_of_convex_parts_is_taken_as_it_is(tmp_path):
@@ -252,15 +225,6 @@ def test_a_mesh_is_cut_once_and_again_if_what_was_kept_is_damaged(tmp_path, monk
     monkeypatch.setenv(kept_arrays.VARIABLE, "")
     cut()
     assert len(cuts) == 5
-
-
-def test_vertices_that_a_file_has_several_times_do_not_open_a_surface(tmp_path):
-    box = trimesh.creation.box((0.02, 0.03, 0.04))
-    box.unmerge_vertices()
-    (tmp_path / "seams.obj").write_text(trimesh.exchange.obj.export_obj(box))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert len(convex_pieces(tmp_path / "seams.obj", 1.0, "here")) == 1
 
 
 BOX = trimesh.creation.box((0.06, 0.06, 0.25))
@@ -357,17 +321,6 @@ def test_specks_flat_parts_and_what_is_inside_are_left_out_and_said(tmp_path):
     assert len(mended(beside(BOX, 0.01, 0.02)).parts) == 3
 
 
-def test_pieces_that_are_off_the_surface_are_said_with_the_figure(tmp_path):
-    pytest.importorskip("coacd")
-    extents, _, (note,) = taken(tmp_path, trimesh.creation.annulus(0.03, 0.04, 0.05, sections=64))
-    np.testing.assert_allclose(extents, (80, 80, 50), atol=0.1)
-    # Eight chords of the hole.
-    out = float(note.split("reach up to ")[1].split()[0])
-    assert 30 * (1 - np.cos(np.pi / 8)) - 0.5 < out < 8.0
-    _, _, (note,) = taken(tmp_path, trimesh.creation.icosphere(subdivisions=3, radius=0.04))
-    assert "reach up to 0.0 mm out of its surface" in note
-
-
 def test_of_too_many_parts_neighbours_are_joined(tmp_path):
     row = [trimesh.creation.box((0.03, 0.02, 0.02)).apply_translation((0.02 * i, 0, 0.001 * i)) for i in range(17)]
     mesh = trimesh.util.concatenate([*row, trimesh.creation.box((0.02, 0.02, 0.1)).apply_translation((0.1, 0.3, 0))])
@@ -388,22 +341,3 @@ def test_the_distance_outside_is_that_to_the_surface():
     aside = np.array((0.1, 0, 0))
     hulls = [BOX.vertices, BOX.vertices + aside]
     np.testing.assert_allclose(surfaces.beyond(hulls, points + 0.15 * aside), (0, 0.015, 0.02, 0.01, 0.075), atol=1e-9)
-
-
-def test_pieces_that_are_too_thin_are_used_and_said_in_one_line(tmp_path):
-    extents, _, (note,) = taken(tmp_path, trimesh.creation.box((0.05, 0.0004, 0.06)))
-    assert "thinner than 2 mm (the thinnest 0.4 mm)" in note
-    np.testing.assert_allclose(extents, (50, 2, 60), atol=1e-3)
-
-
-def test_few_corners_are_left_of_many():
-    ball = np.asarray(trimesh.creation.icosphere(subdivisions=3).vertices)
-    few = thinned(ball)
-    assert len(few) <= compounds.MOST_VERTICES
-    assert trimesh.convex.convex_hull(few).volume > 0.8 * 4 / 3 * np.pi
-    np.testing.assert_allclose(np.ptp(few, axis=0), np.ptp(ball, axis=0))
-    np.testing.assert_array_equal(thinned(ball[:20]), ball[:20])
-
-
-def test_the_names_of_shapes_do_not_meet():
-    assert not {COMPOUND, CONVEX, compounds.FRUSTUM} & set(PRIMITIVES)

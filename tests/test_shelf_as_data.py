@@ -1,43 +1,34 @@
 """A shelf that was measured again is data, as its camera is: together they compile nothing anew."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.candidates import all_candidates
-from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.belief.belief import possible_space, with_target
 from mechsearch_jax.envs.camera import recognisers, simulated_camera
 from mechsearch_jax.envs.camera.recognisers import recogniser
-from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle, sight_of
+from mechsearch_jax.envs.camera.snapshot import Snapshot, sight_of
 from mechsearch_jax.envs.episode import many_slots
-from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.grasping.retrieval import best_grasp
-from mechsearch_jax.images.cloud import thinned_view
-from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import explanation
-from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception.recogniser import Recogniser, labelled
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.problem.problem import build_problem
-from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.compiled import CachedJit
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
-from mechsearch_jax.workspace.shelf import Shelf, hits_shelf, on_host
+from mechsearch_jax.workspace.shelf import Shelf, on_host
 from mechsearch_jax.workspace.target import Target
 
 KEY = jax.random.key(0)
@@ -212,63 +203,6 @@ def test_a_world_is_seen_by_one_program_from_both_cameras(two):
     assert 1e-5 < gap.max() < 0.02
 
 
-def test_a_sight_that_was_given_is_what_is_found_without(two):
-    world = jax.tree.map(jnp.asarray, from_scenario(SCENE))
-    for problem in two:
-        around = problem.camera, problem.shelf
-        given, computed = Snapshot(*around, world, sight_of(*around)), Snapshot(*around, world)
-        assert given.view == computed.view == thinned_view(*around)
-        assert bool(given.target_seen) == bool(computed.target_seen)
-    blind = dataclasses.replace(Camera(), position=(0.6, 0.1, 0.6))
-    # The oracle does not need to see anything.
-    beside = Snapshot(blind, SHELF, world, sight_of(blind, SHELF))
-    assert bool(oracle(KEY, beside).objects.valid.any())
-    with pytest.raises(InputError, match="does not look into the shelf"):
-        _ = beside.view
-
-
-@pytest.mark.slow
-def test_images_are_recognised_by_one_program_for_both(two):
-    images = example_images()
-    parts = recognising.labelled, explanation.explained_image
-    first, second = map(Recogniser, two)
-    seen = first(KEY, images.depth, images.colour)
-    sizes = [cache_size(part) for part in parts]
-    again = second(KEY, images.depth, images.colour)
-    assert [cache_size(part) for part in parts] == sizes
-    assert bool(seen.target_visible) == bool(again.target_visible)
-    places = [np.asarray(view.objects.position)[np.asarray(view.objects.valid)] for view in (seen, again)]
-    assert len(places[0]) == len(places[1]) > 2
-    # The image is the same, and camera and shelf are said to be elsewhere: so are the objects, whose order is the
-    # network's. The fit of one that is hardly seen depends on the shelf.
-    gaps = np.abs(places[0][:, None] - places[1][None]).max(axis=-1)
-    assert 1e-5 < np.median(gaps[linear_sum_assignment(gaps)]) < 0.02
-
-
-def test_bodies_of_trials_are_compiled_once_for_both_shelves():
-    pose, is_found = jnp.zeros(3), jnp.array(True)
-    worlds = [native.trial_world(TARGET, shelf, OBJECTS, pose, is_found) for shelf in (SHELF, SHELF)]
-    size = cache_size(native.trial_world)
-    worlds.append(native.trial_world(TARGET, MOVED, OBJECTS, pose, is_found))
-    assert cache_size(native.trial_world) == size
-    heights = [float(world.position[-1, 2]) for world in worlds]
-    assert heights[0] == heights[1]
-    assert heights[2] - heights[0] == pytest.approx(MOVED.board - SHELF.board, abs=1e-6)
-
-
-def test_a_shelf_that_is_traced_gives_what_a_constant_does():
-    rng = np.random.default_rng(0)
-    low, high = [0.3, -0.4, 0.3], [0.9, 0.6, 0.9]
-    points = jnp.float32(rng.uniform(low, high, (100_000, 3)))
-    q = jnp.float32(HOME + rng.normal(scale=1.5, size=(2000, 7)))
-    for shelf in (SHELF, MOVED):
-        for function, numbers in ((hits_shelf, points), (lambda shelf, q: arm_hits_shelf(q, shelf), q)):
-            constant = jax.jit(functools.partial(function, shelf))(numbers)
-            traced = jax.jit(function)(shelf, numbers)
-            assert 0.02 < constant.mean() < 0.98
-            np.testing.assert_array_equal(constant, traced)
-
-
 def test_of_100_shelves_and_cameras_nearly_all_are_seen_by_one_program():
     """Measured again, to a millimetre and a tenth of a degree."""
     rng = np.random.default_rng(0)
@@ -277,9 +211,3 @@ def test_of_100_shelves_and_cameras_nearly_all_are_seen_by_one_program():
         shelf = SHELF.moved(tuple(rng.normal(scale=1e-3, size=3)))
         sights.append(sight_of(turned(Camera(), rng.normal(scale=TURN / 2)), shelf))
     assert sum(traced_as(sight) == expected for sight in sights) >= 90
-
-
-def test_of_what_all_actions_share_the_shelf_and_the_tables_are_data():
-    space = ActionSpace(SHELF, None, None, None, 0.5, 4)
-    assert jax.tree.structure(space) == jax.tree.structure(dataclasses.replace(space, shelf=MOVED))
-    assert jax.tree.structure(space) != jax.tree.structure(dataclasses.replace(space, waypoints=5))

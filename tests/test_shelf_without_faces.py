@@ -16,8 +16,7 @@ from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.model import compile_model
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.footprints import footprints
-from mechsearch_jax.images.checks import Look, hole_faults
-from mechsearch_jax.images.trained_view import TrainedView, view_faults
+from mechsearch_jax.images.checks import Look
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import recognition_doubt
 from mechsearch_jax.perception.plausibility import image_faults
@@ -151,14 +150,6 @@ def test_one_looks_in_through_every_side_without_a_face():
     assert camera_faults(above, SHELF)
 
 
-def test_views_are_compared_without_the_measures_that_are_missing():
-    large = Shelf(back=1.1, right=-0.9, ceiling=1.2)
-    said = view_faults(CAMERA, large, {"a network": TrainedView()})
-    assert [line for line in said if line.startswith("shelf:")]
-    bare = dataclasses.replace(large, faces=())
-    assert not [line for line in view_faults(CAMERA, bare, {"a network": TrainedView()}) if line.startswith("shelf:")]
-
-
 def test_a_free_motion_keeps_away_from_what_there_is_only():
     rng = np.random.default_rng(0)
     q = HOME + rng.normal(scale=1.0, size=(400, 7))
@@ -176,10 +167,3 @@ def test_a_file_says_which_faces_there_are(tmp_path):
     file.write_text('[shelf]\nfaces = ["top"]\n')
     with pytest.raises(InputError, match=r'mine\.toml:2: \[shelf\] faces \["top"\] must be a list of those'):
         load_settings(file)
-
-
-def test_holes_in_an_image_of_a_table_are_told():
-    depth = depth_of(TABLE).astype(np.float32)
-    rows, columns = (slice(size // 2 - 40, size // 2 + 40) for size in depth.shape)
-    depth[rows, columns] = 0.0
-    assert "nothing was measured" in hole_faults(Look(CAMERA, TABLE, depth))[0]

@@ -1,7 +1,5 @@
 """Stacks: what carries something is not moved before it, and what is on top is an object like others."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +9,10 @@ from hypothesis import strategies as st
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions.candidates import all_candidates, free_candidates, sample_action
-from mechsearch_jax.actions.config import ActionConfig
 from mechsearch_jax.actions.kinds.push import Push
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
-from mechsearch_jax.actions.stacks import stacks
 from mechsearch_jax.actions.types import DrawnCandidate
 from mechsearch_jax.belief.belief import possible_space
-from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.dynamics.rigid import pick_and_place
 from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
@@ -212,29 +207,11 @@ def test_a_push_touches_no_stack(problem, candidates):
 
 
 @pytest.mark.slow
-def test_what_keeps_a_stack_from_being_taken_apart_is_named(problem):
-    # The upper one is too broad for the hand.
-    scene = scene_of(box(LOWER, 0.6, 0.1), box((0.06, 0.06, 0.03), 0.6, 0.1, 0.07), capacity=8)
-    reason = impasse(problem, planner.initial_belief(problem), scene)
-    assert reason == (
-        "the arm reaches 1 of 2 objects, but each way to grasp or push one meets another; object 0 carries object 1"
-    )
-
-
-@pytest.mark.slow
 def test_a_target_that_carries_something_is_not_taken_out_from_under_it(problem):
     tall, pose = 2 * problem.target.half_size[2], jnp.float32([0.55, 0.1, 0.0])
     stands, gone = (scene_of(box((0.03, 0.03, 0.02), 0.55, 0.1, low), capacity=8) for low in (tall, 0.2))
     assert not bool(best_grasp(problem.target_grasps, stands, pose).feasible)
     assert bool(best_grasp(problem.target_grasps, gone, pose).success)
-
-
-def test_the_papers_actions_know_no_stacks(problem):
-
-    space = dataclasses.replace(problem.space, config=ActionConfig(as_in_paper=True))
-    prints = footprints(scene_of(*two()))
-    assert not any(np.asarray(a).any() for a in stacks(space, prints))
-    assert [int(a.sum()) for a in stacks(problem.space, prints)] == [1, 1]
 
 
 @pytest.mark.parametrize("low", [0.07, 0.073])

@@ -18,7 +18,7 @@ from mechsearch_jax.grasping.config import GraspConfig
 from mechsearch_jax.grasping.graspability import feasible_grasps, filled_up, grasp_tables, pair_tables, thinned
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.identity import Uncompared, identity
+from mechsearch_jax.runtime.identity import identity
 from mechsearch_jax.shapes import union
 from mechsearch_jax.shapes.compound import CONVEX, Piece
 from mechsearch_jax.workspace.shelf import Shelf
@@ -65,13 +65,6 @@ def test_the_target_comes_back_from_its_arrays_and_no_other_target_does():
     assert mixed.compound is None
     with pytest.raises(AssertionError):
         _ = mixed.solid
-
-
-def test_uncompared_values_are_alike_everywhere():
-    assert Uncompared(1) == Uncompared("two")
-    assert hash(Uncompared(1)) == hash(Uncompared("two"))
-    assert identity(Uncompared(1)) == identity(Uncompared("two"))
-    assert Uncompared(1).value == 1
 
 
 @pytest.mark.parametrize("target", [ELL, HOOK, *map(Target.from_parts, (CUP, TEE, BOTTLE))])

@@ -14,13 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.images import segments as clouds
 from mechsearch_jax.images.labels import FREE, MISSING, OTHER
-from mechsearch_jax.images.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
+from mechsearch_jax.images.segments import HIDDEN_EDGE, INNER, OUTLINE
 from mechsearch_jax.networks import recognition as model
 from mechsearch_jax.networks import segmentation as layers
 from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
 from mechsearch_jax.networks.segmentation import (
     SegmentationConfig,
-    SegmentationNetwork,
     nearest_neighbours,
     strongest_neighbour,
 )
@@ -28,9 +27,8 @@ from mechsearch_jax.networks.weights import load_weights, save_weights
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
-from mechsearch_jax.train import loop, recognition, scenes, segmentation
+from mechsearch_jax.train import recognition, scenes, segmentation
 from mechsearch_jax.train.loop import CHECKPOINT, SCALARS, TrainConfig, initial_state, learning_rate, train
-from mechsearch_jax.workspace.shelf import Shelf
 
 RECOGNITION = RecognitionConfig(width=32, layers=1, heads=2)
 SEGMENTATION = SegmentationConfig(width=32, layers=2, heads=2, neighbours=8, latents=12)
@@ -56,19 +54,6 @@ def one_program(monkeypatch):
 
 
 # --- segmentation ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_segmentation_follows_the_order_of_the_points():
-    points = jax.random.uniform(jax.random.key(0), (2, 96, 3)) * 0.2 + jnp.array([[[0.5, 0.0, 0.42]]])
-    order = jax.random.permutation(jax.random.key(1), 96)
-    network = jax.jit(SegmentationNetwork(SEGMENTATION).apply)
-    output = network({"params": parameters("segmentation")}, points)
-    turned = network({"params": parameters("segmentation")}, points[:, order])
-    assert output.logits.shape == (2, 2, 96, 10)
-    assert np.allclose(output.logits[:, :, order], turned.logits, atol=1e-3)
-    assert np.allclose(output.centres[:, order], turned.centres, atol=1e-4)
-    assert np.std(output.logits[-1]) > 1e-2
 
 
 # The CPU takes the one, a GPU the other.
@@ -119,24 +104,6 @@ def test_the_strongest_neighbour_and_its_gradient_are_those_of_plain_differentia
     for a, b in zip(ours_slopes, slopes, strict=True):
         assert np.allclose(a, b, atol=1e-5)
         assert np.abs(b).max() > 0.1
-
-
-def test_the_strongest_neighbour_takes_features_of_16_bits():
-    keys = jax.random.split(jax.random.key(4), 3)
-    features = jax.random.normal(keys[0], (40, 8), jnp.bfloat16)
-    offsets, place = jax.random.normal(keys[1], (40, 300, 3)), jnp.ones((3, 8), jnp.bfloat16)
-    neighbours = jax.random.randint(keys[2], (40, 300), 0, 40)
-    strongest = jax.jit(strongest_neighbour)(features, offsets, place, neighbours)
-    exact = np.asarray(features, float)[neighbours] + np.asarray(offsets, float).sum(axis=-1, keepdims=True)
-    assert strongest.dtype == jnp.float32
-    assert np.allclose(strongest, exact.max(axis=1), atol=1e-5)
-    slopes = jax.jit(jax.grad(lambda *a: jnp.sum(strongest_neighbour(*a, neighbours)), argnums=(0, 1, 2)))(
-        features, offsets, place
-    )
-    assert [a.dtype for a in slopes] == [jnp.bfloat16, jnp.float32, jnp.bfloat16]
-    counts = np.zeros((40, 8))
-    np.add.at(counts, (np.take_along_axis(np.asarray(neighbours), exact.argmax(axis=1), axis=1), np.arange(8)), 1)
-    assert np.allclose(np.asarray(slopes[0], float), counts)
 
 
 def numpy_segmentation_loss(logits, labels):
@@ -191,31 +158,6 @@ def test_a_right_segmentation_costs_nothing():
     overlap, present = segmentation.instance_overlaps(segments, labels)
     assert np.array_equal(present, np.isin(np.arange(9), [0, 1, 4]))
     assert np.allclose(overlap[present], 1.0)
-
-
-def test_overlap_of_instances_counts_points():
-    labels = jnp.asarray(np.repeat([0, 1], [60, 40]), jnp.int8)
-    segments = jnp.asarray(np.repeat([3, 5, OTHER], [70, 20, 10]), jnp.int8)
-    overlap, present = segmentation.instance_overlaps(segments, labels)
-    assert np.allclose(overlap[present], [60 / 70, 20 / 40])
-
-
-@pytest.mark.slow
-def test_held_out_scores_tell_apart_what_shows_enough():
-    task = segmentation.SegmentationTask(network=SEGMENTATION, points=256, precision=jnp.float32)
-    scored = segmentation.held_out_scores(task, parameters("segmentation"), 8, batch=8)
-    # The same computation as within, so that it is compiled once.
-    key = jax.random.fold_in(jax.random.key(loop.HELD_OUT_SEED), 0)
-    *_, present, worth, objects, _ = jax.device_get(segmentation._score_batch(task, parameters("segmentation"), key, 8))
-    assert (present.sum(axis=1) <= objects).all()
-    assert (worth <= present).all()
-    assert worth.any(axis=1).all()
-    assert sum(group["scenes"] for group in scored.values()) == 8
-    assert sum(group["all"]["objects"] for group in scored.values()) == present.sum()
-    assert sum(group["100 pixels and more"]["objects"] for group in scored.values()) == worth.sum()
-    for group in scored.values():
-        for part in ("all", "100 pixels and more"):
-            assert 0.0 < group[part]["iou_raw"] < 0.9
 
 
 def test_clean_up_removes_specks_and_dissolves_small_segments():
@@ -279,33 +221,6 @@ def drawn_segments():
     return task, jax.jit(jax.vmap(task.scene))(keys)
 
 
-@pytest.mark.slow
-def test_segments_hold_their_own_points_in_their_frame():
-    task, (_, seen, examples) = drawn_segments()
-    one = jax.tree.map(lambda a: np.asarray(a[0]), examples.segments)
-    labels, points = np.asarray(seen.labels[0]), np.asarray(seen.points[0], float)
-    clouds_of = jax.jit(segment_clouds, static_argnums=1)
-    segments = clouds_of(jax.random.key(1), task.view.camera, seen.points[0], seen.labels[0])
-    assert segments.valid.any()
-    for slot in np.flatnonzero(np.asarray(segments.valid)):
-        turn, origin = np.asarray(segments.T_world_segment[slot, :3, :3], float), segments.T_world_segment[slot, :3, 3]
-        own = points[labels == slot]
-        local = (own - np.asarray(origin)) @ turn
-        mark = np.asarray(segments.mark[slot])
-        of_segment = np.isin(mark, (INNER, OUTLINE, HIDDEN_EDGE))
-        assert segments.pixels[slot] == len(own)
-        distance = np.abs(np.asarray(segments.points[slot])[of_segment][:, None] - local[None]).max(axis=-1).min(axis=1)
-        assert distance.max() < 1e-5
-        assert of_segment.sum() >= task.segments.inner + task.segments.edge
-        assert origin[2] == pytest.approx(Shelf().board)
-        eye = (np.asarray(task.view.camera.position) - np.asarray(origin)) @ turn
-        assert np.allclose(segments.camera[slot], eye, atol=1e-5)
-        assert eye[1] == pytest.approx(0.0, abs=1e-5)
-        assert eye[0] < 0
-        assert np.isin(mark[-task.segments.context :], (CONTEXT, CLEAR)).mean() > 0.9
-    assert one.points.shape == (8, task.segments.points, 3)
-
-
 # --- recognition -----------------------------------------------------------------------------------------------------
 
 
@@ -340,13 +255,6 @@ def test_rotation_vectors_are_scipys():
     slope = jax.jit(jax.jacobian(model.rotation_of))(jnp.zeros(3))
     assert np.isfinite(slope).all()
     assert slope[2, 1, 0] == pytest.approx(1.0)
-
-
-def test_there_are_24_symmetries_of_a_box():
-    assert len(recognition.SYMMETRIES) == 24
-    for a, b in itertools.combinations(recognition.SYMMETRIES, 2):
-        assert np.abs(a - b).max() > 0.5
-    assert np.allclose(np.linalg.det(recognition.SYMMETRIES), 1.0)
 
 
 def same_body(kind, half, rotation, other_half, other_rotation):
@@ -435,19 +343,6 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(slope))
 
 
-def test_height_is_relative_to_a_body_at_rest():
-    zero = jnp.zeros((1, HYPOTHESES, model.OUTPUTS + model.UNCERTAIN))
-    decoded = jax.jit(model.decode)(zero, zero[..., 0])
-    down = np.abs(np.asarray(decoded.rotation[0])[:, 2])
-    size = np.asarray(decoded.size[0])
-    for k in range(HYPOTHESES):
-        box = down[k] @ size[k]
-        round_one = down[k, 2] * size[k, 2] + np.sqrt(1 - min(down[k, 2], 1.0) ** 2) * size[k, 0]
-        assert decoded.position[0, k, 2] == pytest.approx(round_one if IS_ROUND[k] else box, abs=1e-6)
-    slope = jax.jit(jax.grad(lambda o: jnp.sum(model.decode(o, zero[..., 0]).position)))(zero)
-    assert np.isfinite(slope).all()
-
-
 # --- weights ---------------------------------------------------------------------------------------------------------
 
 
@@ -468,61 +363,6 @@ def test_both_networks_fit_ten_megabytes():
         shapes = jax.eval_shape(task.init, jax.random.key(0))
         total += sum(2 * leaf.size for leaf in jax.tree.leaves(shapes))
     assert total < 9.5e6
-
-
-def damaged(tmp_path, name):
-    path = tmp_path / "w.npz"
-    save_weights(path, "recognition", RECOGNITION, parameters("recognition"), {})
-    card = json.loads(path.with_suffix(".json").read_text())
-    if name == "cut short":
-        path.write_bytes(path.read_bytes()[:-100])
-    elif name == "one bit":
-        data = bytearray(path.read_bytes())
-        data[len(data) // 2] ^= 1
-        path.write_bytes(bytes(data))
-    elif name == "no card":
-        path.with_suffix(".json").unlink()
-    elif name == "no file":
-        path.unlink()
-    elif name == "another shape":
-        card["config"]["width"] = 64
-        path.with_suffix(".json").write_text(json.dumps(card))
-    elif name == "another configuration":
-        card["config"]["depth"] = 3
-        path.with_suffix(".json").write_text(json.dumps(card))
-    elif name == "no number":
-        broken = jax.tree.map(lambda a: a.at[...].set(jnp.nan), parameters("recognition"))
-        save_weights(path, "recognition", RECOGNITION, broken, {})
-    elif name == "no JSON":
-        path.with_suffix(".json").write_text("{")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("cut short", "SHA-256"),
-        ("one bit", "SHA-256"),
-        ("no card", "card"),
-        ("no file", "cannot be read"),
-        ("another shape", "shape"),
-        ("another configuration", "config: .* must hold width"),
-        ("no number", "NaN"),
-        ("no JSON", "card"),
-    ],
-)
-def test_damaged_weights_are_refused_in_one_line(tmp_path, name, reason):
-    path = damaged(tmp_path, name)
-    with pytest.raises(InputError, match=reason) as refused:
-        load_weights(path, "recognition")
-    assert "\n" not in str(refused.value)
-    assert str(tmp_path) in str(refused.value)
-
-
-def test_weights_of_the_other_network_are_refused(tmp_path):
-    save_weights(tmp_path / "w.npz", "recognition", RECOGNITION, parameters("recognition"), {})
-    with pytest.raises(InputError, match="segmentation"):
-        load_weights(tmp_path / "w.npz", "segmentation")
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -638,6 +478,7 @@ def test_impossible_trainings_are_refused(wrong, reason):
         TrainConfig(**wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_program")
 def test_training_begins_with_the_weights_that_it_is_given(tmp_path):
     task, archive = segmentation.SegmentationTask(network=SEGMENTATION), tmp_path / "segmentation.npz"

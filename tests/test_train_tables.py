@@ -10,14 +10,10 @@ import pytest
 
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.images.cloud import shelf_view
-from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.images.noise import no_noise
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.primitives import BOX, CYLINDER
 from mechsearch_jax.train import scenes
-from mechsearch_jax.train.places import Places
 from mechsearch_jax.train.recognition import RecognitionTask
-from mechsearch_jax.train.segmentation import SegmentationTask
 from mechsearch_jax.train.vessels import Form, cut_round
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -115,6 +111,7 @@ def tops(world, forms, scene):
     return np.where(able, world.position[scene, :, 2] + reach, np.nan)
 
 
+@pytest.mark.slow
 def test_stacked_bodies_stand_on_a_top_beneath_their_middle():
     (world, forms, support, space, *_), *_ = drawn()
     raised = levels = 0
@@ -154,51 +151,7 @@ def test_no_body_is_in_another():
                 assert inside(world, filled, scene, b, points).max() < 1e-3, (scene, a, b)
 
 
-def test_cameras_look_at_the_scene():
-    (world, _, _, space, usual, place, turn, front), seen, *_ = drawn()
-    assert 0.3 < usual.mean() < 0.7
-    tables = front < space[:, 0] - 1.0
-    assert 0.2 < tables.mean() < 0.6
-    chosen = ~usual & world.valid.any(axis=1)
-    assert (seen.pixels[chosen].sum(axis=1) > 0).mean() > 0.9
-    centre = np.stack([p[v].mean(axis=0) for p, v in zip(world.position[chosen], world.valid[chosen], strict=True)])
-    distance = np.linalg.norm(place[chosen] - centre, axis=1)
-    assert (distance > 0.25).all()
-    assert np.median(distance) < 1.3
-    down = np.rad2deg(np.arcsin(-turn[chosen][:, 2, 2]))
-    assert ((down > -0.1) & (down < 60.1)).all()
-    assert (down[tables[chosen]] > 9.9).all()
-    assert np.abs(np.einsum("sij,skj->sik", turn, turn) - np.eye(3)).max() < 1e-5
-    assert np.allclose(np.linalg.det(turn), 1.0, atol=1e-5)
-
-
-def test_labels_are_of_the_bodies_that_points_lie_on():
-    (world, forms, _, space, *_), seen, *_ = drawn()
-    known, beyond = {*range(world.valid.shape[1]), FREE, OTHER, MISSING}, 0
-    for scene in range(COUNT):
-        assert set(np.unique(seen.labels[scene])) <= known
-        assert not (seen.labels[scene] == OTHER).any()
-        for slot in np.unique(seen.labels[scene][seen.labels[scene] >= 0]):
-            points = seen.points[scene][seen.labels[scene] == slot].astype(float)
-            assert world.valid[scene, slot]
-            assert (points[:, 2] > space[scene, 1]).all()
-            assert np.abs(inside(world, forms, scene, slot, points)).max() < 1e-4, (scene, slot)
-        objects = np.delete(np.bincount(seen.labels[scene][seen.labels[scene] >= 0], minlength=13), TARGET)
-        many = world.valid[scene, TARGET + 1 :].any()
-        beyond += many
-        if many:
-            # By all their pixels; those near the board have no label.
-            assert objects[:TARGET].sum() >= objects[TARGET:].sum()
-    assert beyond >= 3
-
-
-def test_segments_are_as_if_the_board_were_what_they_stand_on():
-    (_, _, support, *_), _, frame, weight = drawn()
-    error = np.abs(frame[:, :, 2, 3] - support[:, :TARGET])[weight > 0]
-    assert error.max() < 0.01
-    assert (support[:, :TARGET][weight > 0] > SHELF.board + 1e-3).sum() > 15
-
-
+@pytest.mark.slow
 def test_the_default_distribution_stays_and_a_key_gives_one_scene():
     make = jax.jit(lambda key: scenes.random_world(key))
     world = make(jax.random.key(7))
@@ -210,33 +163,3 @@ def test_the_default_distribution_stays_and_a_key_gives_one_scene():
     for leaf in jax.tree.leaves(both):
         assert np.array_equal(leaf[0], leaf[1])
     assert not np.array_equal(both[0].position[0], both[0].position[2])
-
-
-def test_a_ninth_object_is_an_instance_and_further_ones_are_none():
-    config = dataclasses.replace(
-        REAL, objects=(12, 12), also=None, target=0.0, sides=(0.02, 0.06), diameters=(0.03, 0.06)
-    )
-    task = SegmentationTask(scenes=config, view=VIEW, points=512)
-    examples = jax.jit(lambda key: task.sample(key, 8))(jax.random.key(0))
-    labels = np.asarray(examples.labels)
-    assert set(np.unique(labels)) == {OTHER, *range(9)}
-    assert examples.points.shape == (8, 512, 3)
-    assert np.isfinite(examples.points).all()
-    assert np.linalg.norm(examples.points - examples.centres, axis=-1)[labels != OTHER].max() < 0.25
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"objects": (1, 17)}, {"stacked": 1.5}, {"taper": (0.5, 1.2)}, {"wall": (0.0, 0.1)}, {"hollow": -0.1}],
-)
-def test_impossible_tables_are_refused(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        scenes.SceneConfig(**wrong)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"tables": 2.0}, {"distance": (0.0, 1.0)}, {"elevation": (0.1, 2.0)}, {"table": ((0.5, 0.4),) * 3}]
-)
-def test_impossible_places_are_refused(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        Places(**wrong)

@@ -171,6 +171,7 @@ def test_actions_through_what_was_not_measured_are_told(problem, whole, holed):
         assert not bool(sweeps_unmeasured(problem, belief, observation.objects, no_action()))
 
 
+@pytest.mark.slow
 def test_a_batch_is_the_same(problem, whole, holed):
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), whole, holed)
     batched = jax.vmap(lambda o: look(problem, o))(both)

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
-from matplotlib.patches import Circle, FancyArrowPatch, Polygon
+from matplotlib.patches import Polygon
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.grasping.graspability import INFEASIBLE
-from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.viz.blockers import MARK, mark_from_above
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
@@ -113,11 +111,6 @@ def ghosts(axes, colour=drawing.ACTION):
     return [p.get_xy()[:-1] for p in dashed if mpl.colors.same_color(p.get_edgecolor(), colour)]
 
 
-def arrow(axes):
-    (one,) = [p for p in axes.patches if isinstance(p, FancyArrowPatch)]
-    return one._path_original.vertices
-
-
 def hands(axes):
     colour = mpl.colors.to_rgb(drawing.HAND)
     polygons = [p for p in axes.patches if isinstance(p, Polygon)]
@@ -132,22 +125,6 @@ def test_the_picture_shows_the_planners_own_prediction():
     assert {tuple(corner) for corner in ghost.round(6)} == {tuple(corner) for corner in expected.round(6)}
     (ghost,) = ghosts(view)
     np.testing.assert_allclose(ghost, drawing.outlines_in_view(moved_on(PICK), CAMERA)[1], atol=1e-6)
-
-
-def test_an_arrow_leads_from_where_an_object_is_to_where_it_goes():
-    view, above = filmed(frame(Target.cylinder(), **shown(PICK))).axes
-    begin, end = (np.asarray(scene.position)[1] for scene in (SCENE, moved_on(PICK)))
-    np.testing.assert_allclose(arrow(above)[[0, -1]], [begin[1::-1], end[1::-1]], atol=1e-6)
-    # In the camera's image, too, it never turns back towards where it comes from.
-    way = arrow(view)
-    assert (np.diff(way @ (way[-1] - way[0])) > 0).all()
-
-
-def test_everything_that_a_push_moves_is_drawn_where_it_ends():
-    after = SCENE.replace(position=SCENE.position.at[:2, 1].add(0.05).at[2, 1].add(1e-3))
-    sketch = kind_of(ActionKind.PUSH).sketch(SCENE, after, PUSH)
-    view, above = filmed(frame(Target.cylinder(), after=after, sketch=sketch)).axes
-    assert len(ghosts(view)) == len(ghosts(above)) == 2
 
 
 @pytest.mark.parametrize(("action", "places"), [(PUSH, 2), (PICK, 2), (RETRIEVAL, 1), (no_action(), 0)])
@@ -165,25 +142,6 @@ def test_the_hand_is_drawn_where_it_acts(action, places):
         assert (left.mean(axis=0) + right.mean(axis=0))[0] / 2 == pytest.approx(tip[0], abs=2e-3)
 
 
-@pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=["cylinder", "box"])
-def test_a_target_that_is_taken_out_is_drawn_in_front_of_the_shelf(target):
-    view, above = filmed(frame(target, found=True, **shown(RETRIEVAL)), target=target).axes
-    (ghost,) = ghosts(above, drawing.TARGET)
-    assert ghost[:, 1].max() < SHELF.front
-    assert arrow(above)[-1, 1] < SHELF.front < arrow(above)[0, 1]
-    # In the camera's image it goes towards the board's front edge, which is further down.
-    assert arrow(view)[-1, 1] > arrow(view)[0, 1]
-    assert len(ghosts(view, drawing.TARGET)) == 1
-
-
-def test_a_hidden_target_is_outlined_in_the_view_and_a_found_one_is_seen():
-    hidden, in_sight = (filmed(frame(Target.cylinder(), found=f)).axes[0] for f in (False, True))
-    (outline,) = ghosts(hidden, drawing.TARGET)
-    middle = np.asarray(project(CAMERA, jnp.array([0.7, 0.1, SHELF.board + 0.05]))[0])[::-1]
-    np.testing.assert_allclose((outline.min(axis=0) + outline.max(axis=0)) / 2, middle, atol=3)
-    assert ghosts(in_sight, drawing.TARGET) == []
-
-
 def test_the_view_is_cut_to_what_stands_there():
     low, high = (drawing.view_window(CAMERA, SHELF, height) for height in (drawing.height_of([SCENE], SHELF), None))
     assert low[3] - low[2] < 0.7 * (high[3] - high[2])
@@ -192,11 +150,6 @@ def test_the_view_is_cut_to_what_stands_there():
         assert (outline < (low[1], low[3])).all()
     tall = SCENE.replace(size=SCENE.size.at[0, 2].set(0.2))
     assert drawing.height_of([SCENE, tall], SHELF) > drawing.height_of([SCENE], SHELF)
-
-
-def test_both_pictures_say_which_side_is_the_robots():
-    for axes in filmed(frame(Target.cylinder())).axes:
-        assert [text.get_text() for text in axes.texts].count("robot's side") == 1
 
 
 @pytest.mark.parametrize("count", [1, 2, 6])
@@ -261,26 +214,6 @@ def test_colours_that_stand_for_different_things_differ_for_everybody(eyes):
     assert apart.min() > 15
 
 
-def test_every_value_of_g_has_one_colour():
-    bands = drawing.bands()
-    for g in range(-30, 2):
-        assert sum(band.low <= g <= band.high for band in bands) == 1
-    assert next(band.label for band in bands if band.low <= 1 - INFEASIBLE <= band.high) == "out of reach"
-
-
-def test_the_window_holds_the_shelf():
-    left, right, top, bottom = drawing.view_window(CAMERA, SHELF)
-    assert 0 <= left < right <= CAMERA.width
-    assert 0 <= top < bottom <= CAMERA.height
-
-
-@pytest.mark.parametrize(("action", "arrows"), [(PUSH, 1), (PICK, 1), (RETRIEVAL, 1), (no_action(), 0)])
-def test_an_action_is_drawn_into_both_pictures(action, arrows):
-    figure = filmed(frame(Target.cylinder(), **shown(action)))
-    for axes in figure.axes:
-        assert sum(isinstance(p, FancyArrowPatch) for p in axes.patches) == arrows
-
-
 def test_warnings_are_legible_and_inside_the_picture():
     lines = [f"warning {k}: " + "what is said of it " * 14 for k in range(4)]
     for heading in ("\n".join(lines), " ".join(lines), "short", "one\ntwo"):
@@ -292,46 +225,6 @@ def test_warnings_are_legible_and_inside_the_picture():
         assert 0 <= box.x0 < box.x1 <= whole.x1
         assert max(axes.get_window_extent().y1 for axes in figure.axes) < box.y0 < box.y1 <= whole.y1
         assert " ".join(text.get_text().split()) == " ".join(heading.split())
-
-
-def test_a_push_points_where_the_gripper_goes():
-    figure = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
-    above = figure.axes[1]
-    way = next(p for p in above.patches if isinstance(p, FancyArrowPatch))._path_original.vertices
-    start, end = way[0], way[-1]
-    np.testing.assert_allclose(start, RIGHT[[1, 0], 3], atol=1e-6)
-    np.testing.assert_allclose(end, RIGHT[[1, 0], 3] + [0.1, 0.0], atol=1e-6)
-    assert above.get_xlim()[0] > above.get_xlim()[1]
-
-
-def test_objects_and_target_are_outlined():
-    hidden, in_sight = (filmed(frame(Target.cylinder(), found=f, **shown(no_action()))).axes[1] for f in (False, True))
-    assert sum(isinstance(p, Polygon) for p in hidden.patches) == 3
-    circle = next(p for p in hidden.patches if isinstance(p, Circle))
-    assert circle.center == (pytest.approx(0.1), pytest.approx(0.7))
-    assert circle.get_facecolor()[3] == 0
-    assert next(p for p in in_sight.patches if isinstance(p, Circle)).get_facecolor()[3] == 1
-
-
-def test_a_long_episode_is_broken_into_lines(tmp_path):
-    frames = [frame(Target.box(), **shown(RETRIEVAL if i == 5 else PUSH)) for i in range(6)]
-    figure = filmstrip(frames, CAMERA, SHELF, Target.box(), "six")
-    assert len(figure.axes) == 12
-    drawing.save_figure(figure, tmp_path / "strip.png", dpi=40)
-    picture = imread(tmp_path / "strip.png")
-    assert picture.shape[0] == pytest.approx(40 * figure.get_figheight(), abs=1)
-    assert picture[..., :3].std() > 0.05
-    assert [p.name for p in tmp_path.iterdir()] == ["strip.png"]
-
-
-def test_maps_become_a_picture(tmp_path):
-    one = frame(Target.cylinder())
-    maps = Maps(Target.cylinder().candidate_poses(SHELF), one.existence, one.graspability, SCENE)
-    figure = maps_figure(
-        maps, one.image, one.owner, one.target_pose, CAMERA, SHELF, Target.cylinder(), heading="two things"
-    )
-    drawing.save_figure(figure, tmp_path / "maps.png", dpi=40)
-    assert imread(tmp_path / "maps.png").shape[1] > 400
 
 
 def test_an_empty_scene_can_be_drawn(tmp_path):
@@ -354,19 +247,6 @@ def test_an_empty_scene_can_be_drawn(tmp_path):
     for figure in drawn:
         drawing.save_figure(figure, tmp_path / "drawn.png", dpi=40)
         assert imread(tmp_path / "drawn.png")[..., :3].std() > 0.05
-
-
-def test_drawing_changes_nothing_global():
-    before = dict(mpl.rcParams)
-    filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
-    assert dict(mpl.rcParams) == before
-
-
-def test_a_picture_that_cannot_be_written_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    figure = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
-    with pytest.raises(InputError, match="cannot be written"):
-        drawing.save_figure(figure, tmp_path / "file" / "strip.png")
 
 
 def test_what_is_in_the_way_is_marked_from_above():

@@ -9,10 +9,8 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.camera import simulated_camera as seen_by
 from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.robot.arm_clearance import link_poses
-from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME
 from mechsearch_jax.shapes import Capsule, in_order, shape_of
-from mechsearch_jax.viz.panda import GREY, panda_solids
+from mechsearch_jax.viz.panda import GREY
 from mechsearch_jax.viz.raycast import RAYS, Eye, VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
@@ -54,22 +52,6 @@ def test_it_sees_what_the_simulated_camera_sees():
     assert differs.mean() < 0.05
 
 
-def test_what_is_drawn_later_is_the_same_as_drawn_at_once():
-    every = list(solids(from_scenario(SCENE)))
-    before = eye().picture(every[:4])
-    kept = before.colour.copy()
-    both = eye().picture(every[4:], before)
-    np.testing.assert_array_equal(both.pixels, eye().picture(every).pixels)
-    np.testing.assert_array_equal(before.colour, kept)
-
-
-def test_a_pixel_is_the_mean_of_its_rays():
-    assert eye().empty().pixels.shape == (CAMERA.height, CAMERA.width, 3)
-    picture = eye().picture(solids(from_scenario(SCENE)))
-    mean = picture.colour[2 * RAYS : 3 * RAYS, 5 * RAYS : 6 * RAYS].mean(axis=(0, 1))
-    np.testing.assert_allclose(picture.pixels[2, 5] / 255, mean, atol=0.003)
-
-
 @pytest.mark.parametrize("distance", [-0.5, 0.0, 4.0])
 def test_what_is_behind_around_or_far_from_the_camera_does_no_harm(distance):
     forward = np.array(CAMERA.rotation)[:, 2]
@@ -105,20 +87,3 @@ def test_rays_meet_a_capsule_where_they_first_come_to_its_surface(seed, radius, 
     normals = Capsule().normal(points, np.broadcast_to(size, points.shape), np)
     assert (np.sum(normals * way[~missed], axis=1) <= 1e-6).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), radius, atol=1e-6)
-
-
-def test_the_panda_has_its_fingers_where_they_are():
-    (poses,) = link_poses(np.asarray(HOME)[None])
-    closed, opened = (panda_solids(poses, opening) for opening in (0.0, 0.08))
-    assert len(closed) == len(opened)
-    moved = [b.position - a.position for a, b in zip(closed, opened, strict=True)]
-    still, fingers = moved[:-6], moved[-6:]
-    np.testing.assert_allclose(still, 0.0)
-    across = poses[7][:3, 1]
-    np.testing.assert_allclose(fingers, np.outer([0.04] * 3 + [-0.04] * 3, across), atol=1e-6)
-    # The finger tips are where the gripper is, and nothing reaches further.
-    tip = poses[7][:3, 3] + FINGER_TIPS * poses[7][:3, 2]
-    reach = [
-        (s.position - tip) @ poses[7][:3, 2] + np.abs(s.rotation.T @ poses[7][:3, 2]) @ s.half_size for s in closed[-6:]
-    ]
-    assert max(reach) == pytest.approx(0.0, abs=0.01)

@@ -87,10 +87,6 @@ def analytic_depth(cam, half, position, yaw, shape):
     return np.where(near < far, near, np.inf)
 
 
-def test_the_default_camera_is_scaled_to_the_papers_number_of_rays():
-    assert COARSE.width * COARSE.height == 18564
-
-
 def test_projection_undoes_the_rays():
     cam = Camera().scaled(20)
     rows, columns = np.meshgrid(np.arange(cam.height), np.arange(cam.width), indexing="ij")
@@ -170,11 +166,6 @@ def test_no_image_outgrows_its_window(half, yaw, lean):
     blurred = np.ones((2 * stride + 1,) * 2)
     assert np.all(merged[ndimage.binary_erosion(whole, blurred, border_value=1)])
     assert np.all(ndimage.binary_dilation(whole, blurred)[merged])
-
-
-def test_a_window_is_no_coarser_than_it_must_be():
-    one = jax.tree.map(lambda a: a[0], scene_of(BOX))
-    assert [int(render.object_window(COARSE, one, (n, n)).stride) for n in (48, 8)] == [1, 3]
 
 
 def test_absent_objects_are_not_seen():

@@ -149,6 +149,14 @@ class _DroppingWorld(NativeWorld):
         return model
 
 
+def check_numbers(seed: int, objects: int) -> None:
+    """Raises an InputError where the seed is negative, or the number of surrounding objects does not fit."""
+    if not 1 <= objects <= MAX_OBJECTS:
+        raise InputError(f"objects: {objects} is not between 1 and {MAX_OBJECTS}")
+    if seed < 0:
+        raise InputError(f"seed: {seed} is negative; use a whole number from 0")
+
+
 class ScenarioGenerator:
     """Makes scenarios; the same seed gives the same scenario on the same machine.
 
@@ -230,10 +238,7 @@ class ScenarioGenerator:
         Raises:
           InputError: the seed is negative, the number of objects does not fit, or no place hides a graspable target.
         """
-        if not 1 <= objects <= MAX_OBJECTS:
-            raise InputError(f"objects: {objects} is not between 1 and {MAX_OBJECTS}")
-        if seed < 0:
-            raise InputError(f"seed: {seed} is negative; use a whole number from 0")
+        check_numbers(seed, objects)
         if not len(self._poses):
             raise InputError(
                 "Target: the arm reaches it nowhere on the board with a grasp that fits it; use a smaller one"

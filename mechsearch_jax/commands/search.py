@@ -239,7 +239,7 @@ def _scene(
     Raises:
       InputError: a file cannot be used; that of a target raises it in the function.
     """
-    from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+    from mechsearch_jax.envs.scenes.generator import ScenarioGenerator, check_numbers
     from mechsearch_jax.envs.scenes.standing import check_standing
     from mechsearch_jax.workspace.scenario import load_scenario
 
@@ -248,4 +248,6 @@ def _scene(
         loaded = load_scenario(file, shelf)
         check_standing({str(file): loaded}, shelf)
         return lambda: loaded
-    return lambda: ScenarioGenerator.of(settings, generated.hides.load()).generate(seed, generated.objects or 0)
+    objects = generated.objects or 0
+    check_numbers(seed, objects)
+    return lambda: ScenarioGenerator.of(settings, generated.hides.load()).generate(seed, objects)

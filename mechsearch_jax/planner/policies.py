@@ -165,16 +165,16 @@ class PlanningPolicy(PyTreeNode):
     ) -> list[tuple[CachedJit, tuple[Any, ...]]]:
         """The programs of a plan and their arguments, of which some are shapes, the longest first."""
         policy, (problem, belief) = self._planning, self._planned_with(problem, belief)
-        observation = observation.with_boxes()
+        objects = observation.with_boxes().objects
         if not self._in_parts:
-            return [(_plan, (policy, key, problem, belief, observation))]
+            return [(_plan, (policy, key, problem, belief, objects))]
         rollout = policy.rollout(problem, belief)
-        begun, weights, drawn = shapes_of_parts(rollout, key, observation.objects)
+        begun, weights, drawn = shapes_of_parts(rollout, key, objects)
         root = begun.state
         return [
             (first_draws, rollout.drawing(root, begun, weights)),
             (candidates_of, (*without_poses(problem, root), begun.possible)),
-            (_begun, (policy, key, problem, belief, observation)),
+            (_begun, (policy, key, problem, belief, objects)),
             (_decided, (policy, problem, belief, root, begun.later, drawn)),
             (_weights, (policy, problem, belief, root)),
         ]
@@ -216,7 +216,7 @@ class PlanningPolicy(PyTreeNode):
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
         unmeasured = {} if observation.measured is None else {"space": _space(problem, belief)}
         grasp = self.grasps(problem.target_grasps, observation.objects, belief.found_pose, *active, **unmeasured)
-        return _retrieval(self, belief, observation, grasp)
+        return _retrieval(self, belief, observation.objects, grasp)
 
     @in_own_settings
     def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
@@ -227,7 +227,7 @@ class PlanningPolicy(PyTreeNode):
         """
         observation = observation.with_boxes()
         run = _plan_in_parts if self._in_parts else _plan
-        decision = run(self._planning, key, *self._planned_with(problem, belief), observation)
+        decision = run(self._planning, key, *self._planned_with(problem, belief), observation.objects)
         if not self.tries:
             return decision
         reached = np.float32(self.objective.reached)
@@ -247,15 +247,16 @@ def _space(problem: Problem, belief: Belief) -> PossibleSpace:
 
 
 @cached_jit()
-def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-    return policy.plan(policy.rollout(problem, belief), key, observation.objects)
+def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, objects: Superquadrics) -> Decision:
+    # Of the objects alone: how sure they are, and what was measured, would make programs of their own.
+    return policy.plan(policy.rollout(problem, belief), key, objects)
 
 
 def _plan_in_parts(
-    policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation
+    policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, objects: Superquadrics
 ) -> Decision:
     """`rollout.plan`, of several programs."""
-    begun = _begun(policy, key, problem, belief, observation)
+    begun = _begun(policy, key, problem, belief, objects)
     root = begun.state.replace(candidates=candidates_of(*without_poses(problem, begun.state), begun.possible))
     weights = _weights(policy, problem, belief, root)
     drawn = first_draws(*policy.rollout(problem, belief).drawing(root, begun, weights))
@@ -263,8 +264,8 @@ def _plan_in_parts(
 
 
 @cached_jit()
-def _begun(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Begun:
-    return begin(policy.rollout(problem, belief), key, observation.objects)
+def _begun(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, objects: Superquadrics) -> Begun:
+    return begin(policy.rollout(problem, belief), key, objects)
 
 
 @cached_jit()
@@ -280,10 +281,9 @@ def _decided(
 
 
 @cached_jit()
-def _retrieval(policy: PlanningPolicy, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
+def _retrieval(policy: PlanningPolicy, belief: Belief, objects: Superquadrics, grasp: GraspChoice) -> Decision:
     """The decision to take a found target out with a grasp (the first if there are several) if it hits nothing."""
-    reached, objects = policy.objective.reached, observation.objects
-    alternatives = None
+    reached, alternatives = policy.objective.reached, None
     if policy.tries:
         allowed = grasp.feasible if policy.config.retrieval_contact else grasp.success
         alternatives = grasps_to_try(grasp.action, allowed & belief.found, objects, reached)

@@ -13,7 +13,7 @@ from pathlib import Path
 import jax
 
 # Raised with every change of what is decided by default, whatever the reason: recognition, belief, plan or trials. So
-# results of equal numbers belong together, and others do not. `tests/test_decision_version.py` holds it to that.
+# results of equal numbers belong together, and others do not. `tests/test_decisions.py` holds it to that.
 DECISION_VERSION = 6
 # Its name among the versions.
 DECISIONS = "decisions"

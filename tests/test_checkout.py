@@ -1,11 +1,17 @@
-"""Imports point one way: from the lab and benchmarks to the simulated shelf, from that to the planner, never round."""
+"""What a checkout has to hold: imports point one way, the gate has its reference, files name one version."""
 
 import ast
+import importlib.util
+import re
 import runpy
+import shlex
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from mechsearch_jax.benchmarks.guard import guard
+from mechsearch_jax.commands import main as cli
 
 ROOT = Path(__file__).parents[1]
 # By their folders; a package in another one is none of its rooms.
@@ -70,12 +76,6 @@ def circles(imported):
     return {room for room in imported if room in reached(room)}
 
 
-def test_a_circle_of_rooms_is_seen():
-    line = {("envs", "trials"): {("envs", "world")}, ("envs", "world"): set()}
-    assert circles(line) == set()
-    assert circles(line | {("envs", "world"): {("envs", "trials")}}) == set(line)
-
-
 def test_packages_import_what_is_below_them_alone():
     imported = arrows(*PACKAGES)
     assert {package for package, _ in imported} == set(PACKAGES)
@@ -123,3 +123,21 @@ def test_the_lab_is_no_part_of_the_wheel(monkeypatch):
     assert not [package for package in packages if place(package)[0] == "lab"]
     data = tomllib.loads(Path("pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     assert set(data) <= set(found["packages"])
+
+
+def test_the_gate_has_a_reference_for_each_of_its_episodes():
+    (line,) = re.findall(r'^step "mechsearch (bench guard .*)"$', (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    arguments = shlex.split(line)
+    assert callable(cli.parse(arguments))
+    scenes, reference = (arguments[arguments.index(name) + 1] for name in ("--scenes", "--reference"))
+    outcomes = guard.read_reference(ROOT / reference).outcomes
+    scene_names = [block.scene_name(index) for block, index in guard.suite(int(scenes))]
+    assert [outcome.scenario for outcome in outcomes] == scene_names
+    assert [comparison.measure for comparison in guard.compare(outcomes, outcomes)] == list(guard.MEASURES)
+
+
+def test_the_files_of_this_checkout_name_the_same_version():
+    spec = importlib.util.spec_from_file_location("version", ROOT / ".ci" / "version.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.check(ROOT)

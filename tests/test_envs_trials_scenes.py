@@ -1,12 +1,18 @@
-"""Compounds as the planner sees them, bodies of several parts, and as trials make them compounds again."""
+"""Scenes that trials happen in: those nearby, with bodies of parts, and tried in processes."""
 
 import dataclasses
+import os
+import signal
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from test_envs_trials import EDGE, FIRM, LOOSE, MODEL, look, pushes, stack
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle
 from mechsearch_jax.envs.pushing import physics_push
@@ -14,16 +20,149 @@ from mechsearch_jax.envs.scenes.household import body_at, household, standing_he
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.compounds import BASE_SHARE, DENSITY, FRICTION, compound_of, with_parts
+from mechsearch_jax.envs.trials.native import NativeTrials
+from mechsearch_jax.envs.trials.nearby import Perturbations, PerturbedScenes
+from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.envs.world import world
 from mechsearch_jax.envs.world.world import BODIES, TARGET, bodies_of, from_scenario
 from mechsearch_jax.geometry.bodies import world_parts
-from mechsearch_jax.geometry.superquadric import Superquadrics, pad
+from mechsearch_jax.geometry.superquadric import Superquadrics, empty, pad
+from mechsearch_jax.planner.trials import TrialResult, TrialScenes, scenes_of
 from mechsearch_jax.shapes.compound import half_extents, inertial
 from mechsearch_jax.shapes.parts import parts_of
 from mechsearch_jax.workspace import scenario as scenarios
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
+
+
+def scenes(rows):
+    objects = empty(8)
+    objects = objects.replace(size=np.tile(np.float32([0.02, 0.05, 0.08]), (8, 1)))
+    objects = jax.tree.map(lambda a: np.stack([np.asarray(a)] * rows), objects)
+    ones = np.ones(rows, np.float32)
+    return TrialScenes(objects, np.zeros((rows, 3), np.float32), np.ones(rows, bool), ones, ones)
+
+
+def test_the_same_differences_whatever_else_is_tried():
+    near = Perturbations()
+    one, many = near.drawn(scenes(1), 2), near.drawn(scenes(3), 2)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+        np.testing.assert_array_equal(np.repeat(a, 3, axis=0), b)
+        assert a.dtype == b.dtype
+    other = near.drawn(scenes(1), 3)
+    assert (one.objects.position[..., :2] != other.objects.position[..., :2]).all()
+    assert near.drawn(many, 0) is many
+
+
+def test_differences_are_as_large_as_they_are_said_to_be():
+    near = Perturbations(place=3e-3, size=0.02)
+    plain = scenes(1)
+    drawn = [near.drawn(plain, n) for n in range(1, 400)]
+    places = np.stack([d.objects.position - plain.objects.position for d in drawn])
+    sizes = np.stack([d.objects.size / plain.objects.size - 1 for d in drawn])
+    poses = np.stack([d.pose for d in drawn])
+    for values, scale in ((places, 3e-3), (sizes, 0.02), (poses, 3e-3)):
+        assert np.std(values[..., :2]) == pytest.approx(scale, rel=0.1)
+        assert abs(np.mean(values[..., :2])) < 0.1 * scale
+    # Heights, and the target's yaw.
+    assert not places[..., 2].any()
+    assert not poses[..., 2].any()
+    np.testing.assert_allclose(sizes[..., 2], 0.0, atol=1e-6)
+    assert all(d.objects.rotation is plain.objects.rotation for d in drawn)
+
+
+def test_things_are_rougher_and_heavier_in_one_scene_and_smoother_and_lighter_in_another():
+    near, plain = Perturbations(friction=1.5, mass=2.0), scenes(2)
+    plain = plain.replace(friction=np.float32([1.0, 0.8]))
+    drawn = [near.drawn(plain, number) for number in (1, 2, 3, 4)]
+    for each, power in zip(drawn, (1, -1, 0, 1), strict=True):
+        np.testing.assert_allclose(each.friction, np.float32([1.0, 0.8]) * 1.5**power, rtol=1e-6)
+        np.testing.assert_allclose(each.mass, 2.0**power, rtol=1e-6)
+        assert each.friction.dtype == each.mass.dtype == np.float32
+
+
+def test_a_scene_is_made_once_by_whichever_thread_comes_first():
+    made, begin = [], threading.Barrier(4)
+
+    def make(number, kept):
+        made.append(number)
+        time.sleep(0.02)
+        return None if number == 1 else f"scene {number}"
+
+    near = PerturbedScenes(make)
+
+    def take(_):
+        begin.wait()
+        return [near[n, (0, 2)] for n in range(3)]
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(take, range(4))) == [["scene 0", None, "scene 2"]] * 4
+    assert sorted(made) == [0, 1, 2]
+
+
+@pytest.fixture(scope="module")
+def rows(problem):
+    """Three scenes, the first without the target, and what is to be tried in two of them."""
+    over, away, aside = pushes()
+    scenes = scenes_of(*stack(look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM)))
+    actions = stack(stack(over, away, aside), stack(aside, over, away), stack(over, over, over))
+    return scenes, actions, np.array([[True, True, True], [True, False, True], [False, False, False]])
+
+
+def until_success(results):
+    """What is said of each row up to its first success, after which nothing counts."""
+    firsts = [[*row, TrialResult.SUCCEEDED].index(TrialResult.SUCCEEDED) for row in results.tolist()]
+    return [row[: first + 1].tolist() for row, first in zip(results, firsts, strict=True)]
+
+
+@pytest.mark.slow
+def test_processes_say_what_this_one_says_also_after_one_of_them_died(problem, rows):
+    expected = MODEL(problem, *rows)
+    assert TrialResult.HARMFUL in expected
+    trials = ProcessTrials(processes=2)
+    try:
+        (begun,) = trials.programs(problem)
+        assert not begun.is_ready()
+        begun.begin()()
+        assert begun.is_ready()
+        for dies in (False, True):
+            if dies:
+                os.kill(next(iter(trials._pool._processes)), signal.SIGKILL)
+            results = trials(problem, *rows)
+            assert until_success(results) == until_success(expected)
+            assert results[2].tolist() == [TrialResult.UNKNOWN] * 3
+    finally:
+        trials.close()
+
+
+@pytest.mark.slow
+def test_of_a_scene_that_ends_its_process_nothing_is_known(problem, rows):
+    @dataclasses.dataclass(frozen=True)
+    class Deadly(NativeTrials):
+        def in_cell(self, cell, scenes, actions, wanted):
+            if scenes.found[0]:
+                os._exit(1)
+            return NativeTrials.in_cell(self, cell, scenes, actions, wanted)
+
+    expected = MODEL(problem, *rows)
+    trials = ProcessTrials(Deadly(), processes=2)
+    try:
+        with pytest.warns(UserWarning, match="a process died as it tried actions"):
+            results = trials(problem, *rows)
+    finally:
+        trials.close()
+    assert until_success(results[:1]) == until_success(expected[:1])
+    assert results[1].tolist() == [TrialResult.UNKNOWN] * 3
+
+
+def test_nothing_begins_where_nothing_is_to_be_tried(problem, rows):
+    scenes, actions, wanted = rows
+    trials = ProcessTrials(processes=2)
+    assert (trials(problem, scenes, actions, wanted & False) == TrialResult.UNKNOWN).all()
+    assert trials._pool is None
+    trials.close()
+
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 UP, STRAIGHT = np.array([0.0, 0.0, 1.0]), np.eye(3)
@@ -70,11 +209,6 @@ def test_true_shapes_are_bodies_of_the_parts(scene):
             np.testing.assert_allclose(np.sort(parts.size[p]), np.sort(wanted[place].size), atol=1e-6)
     np.testing.assert_allclose(scene.size[2], BOX.half_size, atol=1e-6)
     np.testing.assert_allclose(scene.position[2], BOX.position, atol=1e-6)
-
-
-def test_a_scene_without_compounds_has_no_parts():
-    assert scenarios.superquadrics((BOX,)).parts is None
-    assert world.true_superquadrics(from_scenario(Scenario("plain", (BOX,), TARGET_BODY))).parts is None
 
 
 def test_parts_become_a_compound_of_their_volume():
