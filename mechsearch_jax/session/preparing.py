@@ -82,11 +82,13 @@ def decision(problem: Problem, policy: Policy, seen: Observation | None = None) 
       problem, policy: of the search.
       seen: an observation with the shapes of all others; `nothing_seen()` if None.
     """
-    belief, seen = initial_belief(problem), seen or nothing_seen()
-    programs = []
-    if isinstance(policy, PlanningPolicy):
-        programs += plan(policy, jax.random.key(0), problem, belief, seen)
-    return [*programs, program("belief", update_belief, problem, belief, seen, seen, no_action())]
+    initial, seen = initial_belief(problem), seen or nothing_seen()
+    belief = program("belief", update_belief, problem, initial, seen, seen, no_action())
+    if not isinstance(policy, PlanningPolicy):
+        return [belief]
+    # The belief is needed first, and compiles beside the longest part of the plan.
+    longest, *rest = plan(policy, jax.random.key(0), problem, initial, seen)
+    return [longest, belief, *rest]
 
 
 def first_decision(
