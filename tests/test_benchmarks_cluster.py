@@ -6,7 +6,6 @@ import signal
 import socket
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -128,25 +127,6 @@ def ran(folder):
 
 def without_times(rows):
     return [dataclasses.replace(row, **dict.fromkeys(CLOCKED, 0.0)) for row in rows]
-
-
-@pytest.mark.slow
-def test_jobs_of_dead_workers_are_rows_like_the_others(ray, tmp_path):
-    names = ("one", "once", "three", "hang", "five")
-    jobs = jobs_of(tmp_path, *names)
-    begun = Counter()
-
-    def runner(jobs, ended, begin):
-        scripted(tmp_path, time_limit=2.0)(jobs, ended, lambda job: begin(job) and not begun.update([job.key]))
-
-    rows = evaluate(jobs, tmp_path / "rows", runner)
-    assert {row.scenario: row.failure for row in rows} == {
-        **dict.fromkeys(names),
-        "hang": "error: it took longer than 2 s, and its worker was killed",
-    }
-    assert set(begun.values()) == {1}
-    # Of what was lost with the worker, each was run again, and nothing that had ended before.
-    assert Counter(ran(tmp_path)) == Counter([*names, "once"])
 
 
 @pytest.mark.slow

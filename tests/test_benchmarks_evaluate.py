@@ -1,6 +1,7 @@
 """Many episodes: rows as they end, none missing or double, whatever is killed; and failures that are rows."""
 
 import dataclasses
+import io
 import json
 import signal
 import subprocess
@@ -10,12 +11,16 @@ import types
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from scripted import is_gone, one_by_one, run
 
+from mechsearch_jax.benchmarks.report import console_tables
+from mechsearch_jax.benchmarks.report.episode_tables import summary_table
 from mechsearch_jax.benchmarks.running import evaluate as benchmark
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code, shard_of
 from mechsearch_jax.benchmarks.running.processes import Processes
 from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.statistics.variants import Key
 from mechsearch_jax.benchmarks.store.rows import episode_key, identity
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results
 from mechsearch_jax.envs.episode.method import Method
@@ -309,3 +314,16 @@ def test_workers_end_with_the_run_whatever_they_are_doing(tmp_path, files, how):
     worker = int((tmp_path / "log").read_text().split()[1])
     assert is_gone(worker)
     assert read_rows(tmp_path / "rows") == []
+
+
+def test_progress_and_rates_are_shown(tmp_path, files):
+    screen = io.StringIO()
+    console = Console(file=screen, width=100)
+    with console_tables.EpisodeProgress(console, 3) as progress:
+        jobs = make_jobs(files[:3], [Method()], (0,))
+        rows = evaluate(jobs, tmp_path / "rows", one_by_one, ended=progress.ended)
+    console.print(summary_table(summarise(rows), Key.of(rows)))
+    text = screen.getvalue()
+    assert "3/3 raise: the program failed after 0 actions: ValueError: no" in text
+    everything = next(line for line in text.splitlines() if " all " in line)
+    assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.00"]

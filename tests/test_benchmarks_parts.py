@@ -1,7 +1,5 @@
 """What the lab measures: agreement of simulators, classical recovery, segmentation, scenes at their start."""
 
-import dataclasses
-import json
 import math
 
 import jax
@@ -9,19 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stage import HIDDEN, OPEN, TWO
+from stage import HIDDEN, TWO
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.lab.parts import ems, images, scenes
+from mechsearch_jax.benchmarks.lab.parts import ems, images
 from mechsearch_jax.benchmarks.lab.parts.agreement import (
-    Agreement,
-    Case,
     agreement,
     draw_actions,
     pose_differences,
 )
 from mechsearch_jax.benchmarks.lab.parts.exact_existence import exact_existence
-from mechsearch_jax.benchmarks.lab.parts.scenes import look_at_all
 from mechsearch_jax.benchmarks.lab.parts.segmentation import SegmentationBench, overlaps, true_masks
 from mechsearch_jax.benchmarks.parts import simulation
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
@@ -32,9 +27,6 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
-
-CASE = Case("scene", 2, "push", 0, None, None, 0.1, 0.11, 775, 775, 0.004, 1.0, 50.0, 0, 0.002, 4.0)
-VERSIONS = {"device": "cpu: cpu"}
 
 
 def turned(box, cylinder, shift=0.0):
@@ -53,25 +45,6 @@ def test_a_cylinder_has_no_spin_but_a_box_has():
     assert distance == pytest.approx([0.003], abs=1e-6)
     assert angle == pytest.approx([2], abs=0.05)
     assert spin == pytest.approx([40], abs=0.05)
-
-
-def test_the_summary_counts_what_agrees():
-    far = dataclasses.replace(
-        CASE, kind="pick-and-place", position_difference=0.02, batch_failure="dropped", overflow=2
-    )
-    result = Agreement((CASE, CASE, far), 1.0, 3.0, VERSIONS)
-    summary = result.summary()
-    assert list(summary) == ["push", "pick-and-place", "all"]
-    assert summary["push"]["agreeing"] == 1.0
-    assert summary["push"]["agreeing_with_spin"] == 0.0
-    assert summary["push"]["native_agreeing_with_itself"] == 0.0
-    assert summary["all"]["agreeing"] == pytest.approx(2 / 3)
-    assert summary["all"]["same_failure"] == pytest.approx(2 / 3)
-    assert summary["all"]["overflowed"] == 1
-    assert summary["all"]["native_moved_median"] == pytest.approx(0.1)
-    written = json.loads(json.dumps(result.value()))
-    assert len(written["cases"]) == 3
-    assert written["summary"]["all"]["actions"] == 3
 
 
 @pytest.mark.slow
@@ -207,23 +180,6 @@ def test_overlaps_are_those_of_a_plain_count():
     for i in range(TARGET):
         both, either = np.sum((segments == i) & (truth == i)), np.sum((segments == i) | (truth == i))
         assert iou[i] == pytest.approx(both / either) if (truth == i).any() else np.isnan(iou[i])
-
-
-@pytest.fixture(scope="module")
-def looked(problem):
-    """Three scenes, looked at with the problem that other tests have built."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "cached_problem", lambda target: problem)
-        return {row.scenario: row for row in look_at_all({"stage": [HIDDEN, OPEN, TWO]})}
-
-
-def test_f_is_that_of_a_target_that_is_not_seen(looked):
-    # Behind the box the target can be; where nothing hides it, it cannot.
-    assert looked["hidden"].truth_possible
-    assert not looked["open"].truth_possible
-    assert 10 < looked["hidden"].possible < 200
-    assert looked["two"].possible > looked["hidden"].possible
-    assert {row.candidates for row in looked.values()} == {792}
 
 
 @pytest.mark.slow

@@ -99,3 +99,13 @@ def test_a_set_is_written_into_a_folder_and_nothing_is_overwritten(folder, capsy
         generate()
     assert (folder / "new" / "d1-002.json").read_text() == "mine"
     assert not (folder / "new" / "d1-000.json").exists()
+
+
+def test_sets_are_listed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    cli.parse(["scenarios", "list"])()
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    rows = {line[0]: line for line in lines[1:]}
+    assert set(rows) == set(scene_sets.SETS)
+    assert rows["c2-6"] == ["c2-6", "180", "6", "cylinder", scene_sets.digest(scene_sets.SETS["c2-6"])]
+    assert rows["d3"][:5] == ["d3", "80", "4,", "8", "box"]

@@ -1,6 +1,7 @@
 """`mechsearch doctor`: what it finds, what it advises, and when it says that nothing works."""
 
 import dataclasses
+import importlib.metadata
 import re
 import sys
 
@@ -10,6 +11,7 @@ import pytest
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.health import cell_health as health
 from mechsearch_jax.envs.health.cell_health import State
+from mechsearch_jax.problem import cache
 from mechsearch_jax.problem.problem import NOWHERE
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
@@ -116,3 +118,37 @@ def test_a_check_that_fails_is_reported():
     (needed,) = health.examine("simulator", fails)
     assert (needed.state, needed.says) == (State.BROKEN, "RuntimeError: two lines")
     assert next(iter(health.examine("meshes", fails))).state is State.MISSING
+
+
+def test_versions_devices_and_simulator_are_named():
+    (versions,) = findings_of("versions")
+    assert versions.state is State.FINE
+    assert f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')}" in versions.says
+    assert "JAX computes on cpu" in findings_of("devices")[0].says
+    assert findings_of("simulator")[0].state is State.FINE
+
+
+def test_a_package_that_is_missing_breaks_the_main_job(monkeypatch):
+    monkeypatch.setattr(health, "PACKAGES", ("jax", "no-such-package"))
+    broken = findings_of("versions")[-1]
+    assert (broken.state, broken.remedy) == (State.BROKEN, "pip install no-such-package")
+
+
+@pytest.mark.parametrize(("state", "status"), [(State.MISSING, None), (State.BROKEN, 1)])
+def test_the_status_says_whether_the_main_job_runs(monkeypatch, capsys, state, status):
+    def check():
+        yield health.Finding("weights", state, "gone", "install them")
+
+    monkeypatch.setattr(health, "CHECKS", {"weights": check})
+    monkeypatch.setattr(cache, "is_cached", lambda *args, **parts: True)
+    command = cli.parse(["doctor"])
+    if status:
+        with pytest.raises(SystemExit) as end:
+            command()
+        assert end.value.code == status
+    else:
+        command()
+    printed = capsys.readouterr().out
+    assert "gone" in printed
+    assert "-> install them" in printed
+    assert printed.splitlines()[-1] == ("nothing can be searched here" if status else "searching works here")
