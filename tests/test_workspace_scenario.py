@@ -110,6 +110,17 @@ def test_what_is_written_is_read_back(tmp_path):
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["scene.json"]
 
 
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "scene.json"
+    scenarios.save_scenario(SCENE, path)
+    before = path.read_text()
+    broken = dataclasses.replace(SCENE.target, position=(float("nan"), 0.0, 0.0))
+    with pytest.raises(ValueError):
+        scenarios.save_scenario(dataclasses.replace(SCENE, target=broken), path)
+    assert path.read_text() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.json"]
+
+
 def test_an_unwritable_place_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
