@@ -440,8 +440,8 @@ def test_a_decision_is_the_same_in_the_blocks_of_a_gpu(decision, problem, monkey
 class Shaky:
     """The quasi-static model, which fears that everything it moves may topple, or does not know what becomes of it."""
 
-    chance: float | jax.Array
-    residual: float | jax.Array
+    chance: float
+    residual: float
 
     def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
         motion = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
@@ -450,8 +450,8 @@ class Shaky:
 
 
 # The first is executed as ever, and the second nevertheless.
-CHANCES = jnp.float32([0.0, 0.4, 0.6, np.nan, 0.0, 0.0])
-RESIDUALS = jnp.float32([0.0, 0.0, 0.0, 0.0, np.nan, np.inf])
+CHANCES = (0.0, 0.4, 0.6, np.nan, 0.0, 0.0)
+RESIDUALS = (0.0, 0.0, 0.0, 0.0, np.nan, np.inf)
 
 
 def foreseen(model):
@@ -469,9 +469,9 @@ def drawn(decision, root, problem):
             rollout = POLICY.rollout(problem, belief)
             possible, weights = rollout.possible(root), rollout.weights(root)
             sample = rollout.propose(key, problem, root, possible, weights, jnp.array(True))
-            predict = lambda *shaky: foreseen(Shaky(*shaky))(problem, root, sample, True)  # noqa: E731
-            prediction = jax.vmap(predict)(CHANCES, RESIDUALS)
-            return sample, prediction.possible
+            # One after the other: a model is static, and must not hold what is traced.
+            models = [Shaky(*shaky) for shaky in zip(CHANCES, RESIDUALS, strict=True)]
+            return sample, jnp.stack([foreseen(model)(problem, root, sample, True).possible for model in models])
 
         return jax.vmap(one)(keys)
 
