@@ -161,7 +161,7 @@ def test_a_found_target_stands_in_trials_as_what_it_is():
     at, nothing = jnp.array([0.6, 0.1, 0.5]), jax.device_get(empty(TARGET))
     for found in (True, False):
         world = jax.device_get(trials.trial_world(MUG, SHELF, nothing, at, jnp.array(found)))
-        scene = trials.scene_at_rest(cell, simulation, world, nothing, 1.0, 1.0)
+        scene = trials.scene_at_rest(cell, simulation, world, nothing, 1.0)
         assert scene is not None
         assert not scene.diverged
         body = scene._bodies[TARGET]

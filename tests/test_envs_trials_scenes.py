@@ -40,8 +40,7 @@ def scenes(rows):
     objects = empty(8)
     objects = objects.replace(size=np.tile(np.float32([0.02, 0.05, 0.08]), (8, 1)))
     objects = jax.tree.map(lambda a: np.stack([np.asarray(a)] * rows), objects)
-    ones = np.ones(rows, np.float32)
-    return TrialScenes(objects, np.zeros((rows, 3), np.float32), np.ones(rows, bool), ones, ones)
+    return TrialScenes(objects, np.zeros((rows, 3), np.float32), np.ones(rows, bool), np.ones(rows, np.float32))
 
 
 def test_the_same_differences_whatever_else_is_tried():
@@ -72,14 +71,13 @@ def test_differences_are_as_large_as_they_are_said_to_be():
     assert all(d.objects.rotation is plain.objects.rotation for d in drawn)
 
 
-def test_things_are_rougher_and_heavier_in_one_scene_and_smoother_and_lighter_in_another():
-    near, plain = Perturbations(friction=1.5, mass=2.0), scenes(2)
+def test_things_are_rougher_in_one_scene_and_smoother_in_another():
+    near, plain = Perturbations(friction=1.5), scenes(2)
     plain = plain.replace(friction=np.float32([1.0, 0.8]))
     drawn = [near.drawn(plain, number) for number in (1, 2, 3, 4)]
     for each, power in zip(drawn, (1, -1, 0, 1), strict=True):
         np.testing.assert_allclose(each.friction, np.float32([1.0, 0.8]) * 1.5**power, rtol=1e-6)
-        np.testing.assert_allclose(each.mass, 2.0**power, rtol=1e-6)
-        assert each.friction.dtype == each.mass.dtype == np.float32
+        assert each.friction.dtype == np.float32
 
 
 def test_a_scene_is_made_once_by_whichever_thread_comes_first():

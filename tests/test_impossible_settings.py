@@ -44,7 +44,7 @@ IMPOSSIBLE = (
     (SimulatorConfig, None, {"tracking_bound": 0}, {"settle_steps": -1.0}, {"slip": NAN}),
     (MotionConfig, "must be positive", {"timestep": 0.0}),
     (MotionConfig, None, {"waypoints": 1}, {"carry_pace": 1.5}),
-    (Perturbations, None, {"friction": 0.9}, {"mass": NAN}, {"scenes": -1}, {"place": INFINITE}, {"size": NAN}),
+    (Perturbations, None, {"friction": 0.9}, {"friction": NAN}, {"scenes": -1}, {"place": INFINITE}, {"size": NAN}),
     (TargetColour, "TargetColour", {"rgb": (2.0, 0.0, 0.0)}, {"threshold": 0.0}),
     (ExplanationConfig, None, {"gain": -1.0}, {"wrong": 0.0}, {"splits": 17}),
     (PartsConfig, None, {"wrong": 0.0}, {"part": -1.0}),

@@ -94,7 +94,7 @@ def test_what_is_impossible_is_not_tried_and_hides_nothing():
 
 
 def test_where_few_differ_every_place_is_of_another_sequence():
-    order, alternatives = tried(sequences_of(*[action()] * 12))
+    order, alternatives = tried(sequences_of(*[action()] * (TRIES + 4)))
     assert order == [0]
     assert len(set(np.asarray(alternatives.sequence).tolist())) == len(alternatives.worth) == TRIES
     assert len(sequences_to_try(sequences_of(action()), OBJECTS, jnp.float32(0.0)).worth) == 1
@@ -129,8 +129,8 @@ BATCHED = jax.jit(jax.vmap(functools.partial(sequences_to_try, now=OBJECTS, reac
             st.sampled_from([0.05, 0.1, 0.15]),
             st.booleans(),
         ),
-        min_size=20,
-        max_size=20,
+        min_size=30,
+        max_size=30,
     )
 )
 def test_the_tried_are_those_of_a_loop_alone_and_batched(drawn):

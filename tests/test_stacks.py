@@ -220,7 +220,7 @@ def test_trials_begin_with_the_stack_as_it_is_recognised(problem, low):
     cell = TrialSetup(problem.target, problem.shelf, problem.gripper)
     world = jax.device_get(trial_world(*cell[:2], scene, jnp.zeros(3), jnp.array(False)))
     np.testing.assert_allclose(world.position[1, 2], BOARD + low + UPPER[2], atol=1e-6)
-    made = scene_at_rest(cell, SimulatorConfig(), world, scene, 1.0, 1.0)
+    made = scene_at_rest(cell, SimulatorConfig(), world, scene, 1.0)
     rest = made._data.qpos[-63:].reshape(9, 7)
     np.testing.assert_allclose(rest[:2, :3], [[0.55, 0.1, BOARD + 0.035], [0.55, 0.1, BOARD + 0.1]], atol=1.5e-3)
 

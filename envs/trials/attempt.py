@@ -71,7 +71,6 @@ class TrialScene(NativeWorld):
         config: SimulatorConfig,
         bodies: list[Body | None],
         friction: float = 1.0,
-        mass: float = 1.0,
     ):
         """Let bodies come to rest.
 
@@ -79,13 +78,13 @@ class TrialScene(NativeWorld):
           shelf: of the scene.
           config: of the simulation.
           bodies: in their slots.
-          friction, mass: factors on all sliding frictions, and on the bodies' masses.
+          friction: factor on all sliding frictions.
 
         Raises:
           ValueError, mujoco.FatalError: MuJoCo cannot build the scene.
         """
         super().__init__(shelf, config=config, blank=blank_model(shelf, config.motion.timestep))
-        self.place(bodies, TrueCell(friction, mass))
+        self.place(bodies, TrueCell(friction))
         self._model.opt.sleep_tolerance = config.rest_speed
         self._hide_what_is_no_body()
         self._rest_again(np.empty((0, 0)))

@@ -142,8 +142,8 @@ class NativeTrials:
         """The world of a row with the kept objects, and its scene at rest; None if it cannot be built."""
         objects = jax.tree.map(lambda a: a[row, list(kept)], scenes.objects)
         world = jax.device_get(trial_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
-        friction, mass = self.friction * float(scenes.friction[row]), float(scenes.mass[row])
-        return world, scene_at_rest(cell, simulation, world, objects, friction, mass)
+        friction = self.friction * float(scenes.friction[row])
+        return world, scene_at_rest(cell, simulation, world, objects, friction)
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
@@ -217,11 +217,10 @@ def scene_at_rest(
     world: World,
     objects: Superquadrics,
     friction: float,
-    mass: float,
 ) -> TrialScene | None:
     """A scene at rest; None if MuJoCo cannot build it, so that one invalid scene does not end the other trials."""
     try:
         made = with_parts(with_target(bodies_of(world), cell.target), objects)
-        return TrialScene(cell.shelf, simulation, made, friction, mass)
+        return TrialScene(cell.shelf, simulation, made, friction)
     except (ValueError, mujoco.FatalError):
         return None

@@ -1,7 +1,7 @@
 """Scenes near a recognised one, in which a grasp of the target has to succeed, too, and nothing may do harm.
 
 A grasp that brushes something may take the target out in one scene and be held up in another that is a third of a
-millimetre off, less than recognition can know, or where things are rougher or heavier than assumed. One trial says
+millimetre off, less than recognition can know, or where things are rougher than assumed. One trial says
 nothing of that.
 """
 
@@ -31,23 +31,22 @@ class Perturbations:
       scenes: their number; 0 for none.
       place: standard deviation of the places of objects and target along x and y [m].
       size: standard deviation of the objects' sizes along their own x and y, as a share.
-      friction, mass: factors on all frictions and masses: of the first scene, its inverse of the second, none of the
-        third, and so on; about how far off an assumed friction is.
+      friction: factor on all frictions: of the first scene, its inverse of the second, none of the third, and so on;
+        about how far off an assumed friction is. Masses stay: an arm that is held up by heavier things hides what
+        would fall.
 
     Raises:
-      InputError: a number is negative or not finite, or a factor below 1.
+      InputError: a number is negative or not finite, or the factor below 1.
     """
 
     scenes: int = 3
     place: float = 5e-4
     size: float = 5e-3
     friction: float = 2.0
-    mass: float = 1.5
 
     def __post_init__(self):
-        for name in ("friction", "mass"):
-            if not 1 <= getattr(self, name) < math.inf:
-                raise InputError(f"Perturbations: {name} {getattr(self, name)} must be a finite factor of at least 1")
+        if not 1 <= self.friction < math.inf:
+            raise InputError(f"Perturbations: friction {self.friction} must be a finite factor of at least 1")
         for name in ("scenes", "place", "size"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"Perturbations: {name} {getattr(self, name)} must be finite and not negative")
@@ -77,7 +76,6 @@ class Perturbations:
             objects=objects.replace(position=position, size=size),
             pose=pose,
             friction=scenes.friction * np.float32(self.friction**power),
-            mass=scenes.mass * np.float32(self.mass**power),
         )
 
 

@@ -28,7 +28,7 @@ from mechsearch_jax.runtime.compiled import cached_jit
 from mechsearch_jax.runtime.pytree import PyTreeNode
 
 # Largest number of first actions of sequences that are tried; for grasps see `retrieval.TRIES`.
-TRIES = 8
+TRIES = 24
 # Two actions of the same kind and object are alike if the gripper begins within this of the other's place, also ends
 # within it [m], and approaches within this angle of it [rad].
 ALIKE, ALIKE_APPROACH = 0.02, math.radians(10)
@@ -63,14 +63,13 @@ class TrialScenes(PyTreeNode):
       objects: the recognised objects without the target, fields (R, N, ...).
       pose: pose of the target as x, y [m], yaw [rad], shape (R, 3).
       found: whether the target is found, shape (R,).
-      friction, mass: multiples of the assumed frictions and masses, shape (R,).
+      friction: multiple of the assumed frictions, shape (R,).
     """
 
     objects: Superquadrics
     pose: jax.Array
     found: jax.Array
     friction: jax.Array
-    mass: jax.Array
 
 
 class Trials(Protocol):
@@ -141,10 +140,9 @@ def tried(alternatives: Alternatives, results: Int[np.ndarray, "1 k"]) -> TriedA
 
 
 def scenes_of(belief: Belief, observation: Observation) -> TrialScenes:
-    """Scenes for trials, with friction and mass as assumed; any leading axes, or none."""
-    found = belief.found
-    ones = jnp.ones(jnp.shape(found), jnp.float32)
-    return TrialScenes(observation.objects, belief.found_pose, found, ones, ones)
+    """Scenes for trials, with friction as assumed; any leading axes, or none."""
+    friction = jnp.ones(jnp.shape(belief.found), jnp.float32)
+    return TrialScenes(observation.objects, belief.found_pose, belief.found, friction)
 
 
 def grasps_to_try(actions: Action, worth: Bool[Array, " k"], now: Superquadrics, reached: float) -> Alternatives:

@@ -14,7 +14,7 @@ import jax
 
 # Raised with every change of what is decided by default, whatever the reason: recognition, belief, plan or trials. So
 # results of equal numbers belong together, and others do not. `tests/test_decisions.py` holds it to that.
-DECISION_VERSION = 6
+DECISION_VERSION = 7
 # Its name among the versions.
 DECISIONS = "decisions"
 # Folders of `mechsearch_jax` that do not influence decisions, and packages that are installed beneath it.
