@@ -21,7 +21,8 @@ from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.compounds import BASE_SHARE, DENSITY, FRICTION, compound_of, with_parts
 from mechsearch_jax.envs.trials.native import NativeTrials
-from mechsearch_jax.envs.trials.nearby import Perturbations, PerturbedScenes
+from mechsearch_jax.envs.trials.nearby import Perturbations
+from mechsearch_jax.envs.trials.order import Once
 from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.envs.world import world
 from mechsearch_jax.envs.world.world import BODIES, TARGET, bodies_of, from_scenario
@@ -80,22 +81,24 @@ def test_things_are_rougher_in_one_scene_and_smoother_in_another():
         assert each.friction.dtype == np.float32
 
 
-def test_a_scene_is_made_once_by_whichever_thread_comes_first():
-    made, begin = [], threading.Barrier(4)
+def test_a_value_is_computed_once_by_whichever_thread_comes_first():
+    made, once, begin = [], Once(), threading.Barrier(4)
 
-    def make(number, kept):
+    def make(number):
         made.append(number)
         time.sleep(0.02)
-        return None if number == 1 else f"scene {number}"
-
-    near = PerturbedScenes(make)
+        if number == 1:
+            raise ValueError("no such scene")
+        return f"scene {number}"
 
     def take(_):
         begin.wait()
-        return [near[n, (0, 2)] for n in range(3)]
+        with pytest.raises(ValueError, match="no such scene"):
+            once(1, lambda: make(1))
+        return [once(n, lambda n=n: make(n)) for n in (0, 2)]
 
     with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(take, range(4))) == [["scene 0", None, "scene 2"]] * 4
+        assert list(pool.map(take, range(4))) == [["scene 0", "scene 2"]] * 4
     assert sorted(made) == [0, 1, 2]
 
 

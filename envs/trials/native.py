@@ -31,8 +31,8 @@ from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.compounds import with_parts, with_target
-from mechsearch_jax.envs.trials.nearby import Perturbations, PerturbedScenes
-from mechsearch_jax.envs.trials.order import in_order
+from mechsearch_jax.envs.trials.nearby import Perturbations
+from mechsearch_jax.envs.trials.order import Once, in_order
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, outer_shape
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose
@@ -47,8 +47,6 @@ from mechsearch_jax.session.preparing import Program, motions, program
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Worlds near that of a row, and their scenes; None for one that MuJoCo cannot build.
-_Near = PerturbedScenes[tuple[World, TrialScene | None]]
 # Places along each straight part of a gripper's path.
 _PLACES = 5
 
@@ -59,6 +57,13 @@ class TrialSetup(NamedTuple):
     target: Target
     shelf: Shelf
     gripper: Gripper
+
+
+class _Try(NamedTuple):
+    """What tries an action in the scene of a number, once, and whether the action takes the target out."""
+
+    tried: Callable[[int, Callable[[], bool]], TrialResult | None]
+    takes_target: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,37 +109,66 @@ class NativeTrials:
         simulation = dataclasses.replace(self.simulation, motion=config)
         actions, scenes = jax.device_get((actions, scenes))
 
-        def make(row: int) -> _Near:
-            return PerturbedScenes(
-                lambda number, kept: self._scene(cell, simulation, self.nearby.drawn(scenes, number), row, kept)
-            )
+        nearby = self.nearby.scenes
 
-        def attempt(near: _Near, row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
+        def begun(once: Once, row: int, i: int) -> _Try | TrialResult:
+            """What tries an action in the scene of a number, or its result without a trial."""
             action: Action = jax.tree.map(lambda a: np.asarray(a[row, i]), actions)
             kept = near_path(jax.tree.map(lambda a: a[row], scenes.objects), action, cell.gripper.approach)
             kind = kind_of(int(action.kind))
             motion = jax.device_get(reference_motion(kind, action, config))
             if motion is None or not motion[1]:
                 return TrialResult.FAILED
-            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (near[0, kept][0], motion[0]))):
+
+            def scene(number: int) -> tuple[World, TrialScene | None]:
+                near = self.nearby.drawn(scenes, number)
+                return once((number, kept), lambda: self._scene(cell, simulation, near, row, kept))
+
+            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (scene(0)[0], motion[0]))):
                 return TrialResult.UNKNOWN
             index = kept.index(int(action.object)) if int(action.object) in kept else TARGET
 
-            def tried(number: int) -> TrialResult | None:
-                return _attempted(near[number, kept][1], kind, motion[0], index, needed) if needed() else None
+            def tried(number: int, needed: Callable[[], bool]) -> TrialResult | None:
+                attempted = lambda: _attempted(scene(number)[1], kind, motion[0], index, needed)  # noqa: E731
+                return once((i, number), lambda: attempted() if needed() else None)
 
-            result = tried(0)
-            if result is TrialResult.SUCCEEDED and not kind.takes_target:
+            return _Try(tried, kind.takes_target)
+
+        def ahead(once: Once, row: int, i: int) -> None:
+            """Try an action that is being tried in the scenes near, while it may succeed."""
+            action = begun(once, row, i)
+            if isinstance(action, TrialResult):
+                return
+
+            def promising() -> bool:
+                present = once.begun((i, 0))
+                return present is None or not present.done() or present.result() is TrialResult.SUCCEEDED
+
+            # From the other end, so that none waits for the same.
+            numbers = (1, *range(nearby, 1, -1)) if action.takes_target else (1,)
+            for number in numbers[:nearby]:
+                action.tried(number, promising)
+
+        def attempt(once: Once, row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
+            first = int(np.argmax(wanted[row]))
+            if i != first:
+                # Most often it is the first that is made: the sooner all of it is known, the better.
+                ahead(once, row, first)
+            action = begun(once, row, i) if needed() else None
+            if action is None or isinstance(action, TrialResult):
+                return action
+            result = action.tried(0, needed)
+            if result is TrialResult.SUCCEEDED and not action.takes_target:
                 # Where the arm is only held up, the search goes on.
-                harm = self.nearby.scenes > 0 and tried(1) is TrialResult.HARMFUL
+                harm = nearby > 0 and action.tried(1, needed) is TrialResult.HARMFUL
                 return TrialResult.UNSURE if harm else result
-            for number in range(1, 1 + self.nearby.scenes * (result is TrialResult.SUCCEEDED)):
-                result = tried(number)
+            for number in range(1, 1 + nearby * (result is TrialResult.SUCCEEDED)):
+                result = action.tried(number, needed)
                 if result is not TrialResult.SUCCEEDED:
                     return TrialResult.UNSURE if result is TrialResult.FAILED else result
             return result
 
-        return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
+        return in_order(np.asarray(wanted), self.threads or cores(), lambda row: Once(), attempt)
 
     def _scene(
         self, cell: TrialSetup, simulation: SimulatorConfig, scenes: TrialScenes, row: int, kept: tuple[int, ...]

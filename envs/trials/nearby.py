@@ -9,16 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import threading
-from collections.abc import Callable
-from typing import Generic, TypeVar
 
 import numpy as np
 
 from mechsearch_jax.planner.trials import TrialScenes
 from mechsearch_jax.runtime.errors import InputError
 
-Scene = TypeVar("Scene")
 # Of the drawn differences, which are the same for all scenes and decisions.
 SEED = 7
 
@@ -77,21 +73,3 @@ class Perturbations:
             pose=pose,
             friction=scenes.friction * np.float32(self.friction**power),
         )
-
-
-class PerturbedScenes(Generic[Scene]):
-    """A scene, by the number 0, and those near it, with some of its objects; each is made when first needed, once.
-
-    Args:
-      make: makes the scene of a number with the objects of some slots.
-    """
-
-    def __init__(self, make: Callable[[int, tuple[int, ...]], Scene]) -> None:
-        self._make, self._lock = make, threading.Lock()
-        self._made: dict[tuple[int, tuple[int, ...]], Scene] = {}
-
-    def __getitem__(self, key: tuple[int, tuple[int, ...]]) -> Scene:
-        with self._lock:
-            if key not in self._made:
-                self._made[key] = self._make(*key)
-            return self._made[key]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Generic, TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -18,6 +18,29 @@ Scene = TypeVar("Scene")
 THREADS = 2
 # Tries column i of row r in its scene; returns None if `needed` turns False meanwhile.
 Attempt = Callable[[Scene, int, int, Callable[[], bool]], TrialResult | None]
+
+
+class Once:
+    """What is computed once for each key, by the thread that asks first; others wait for it."""
+
+    def __init__(self) -> None:
+        self._lock, self._made = threading.Lock(), dict[Any, Future[Any]]()
+
+    def begun(self, key: Any) -> Future[Any] | None:
+        """What a thread computes, or has computed, for a key; None if none has asked."""
+        return self._made.get(key)
+
+    def __call__(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What `make` returns, or what it raises."""
+        with self._lock:
+            first = key not in self._made
+            future = self._made.setdefault(key, Future())
+        if first:
+            try:
+                future.set_result(make())
+            except BaseException as error:
+                future.set_exception(error)
+        return future.result()
 
 
 class _Row(Generic[Scene]):
