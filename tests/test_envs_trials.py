@@ -190,7 +190,7 @@ def test_a_retrieval_is_tried_in_each_scene_nearby_and_a_push_in_the_first(probl
             called.append(scene)
             return next(said)
 
-        monkeypatch.setattr(native, "_attempted", attempted)
+        monkeypatch.setattr(TrialScene, "attempt", attempted)
         assert results_of(NativeTrials(threads=1), problem, seen, at, True, action).tolist() == [result]
         assert len(called) == len(set(map(id, called))) == calls
 
@@ -604,22 +604,16 @@ def test_what_is_worth_trying_in_all_slots_is_tried_together(problem):
 
 @pytest.mark.parametrize("threads", [1, 3, 16])
 def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(threads):
-    made, tried = [], []
+    tried = []
 
-    def attempt(scene, row, i, needed):
-        assert scene == 10 * row
+    def attempt(row, i, needed):
         tried.append((row, i))
         time.sleep(0.001)
         if not needed():
             return None
         return DONE if i >= (3, 6)[row] else FAILED
 
-    def make(row):
-        made.append(row)
-        return 10 * row
-
-    results = in_order(np.ones((2, TRIES), bool), threads, make, attempt)
-    assert sorted(made) == [0, 1]
+    results = in_order(np.ones((2, TRIES), bool), threads, attempt)
     assert results.argmax(axis=1).tolist() == [3, 6]
     assert (results.max(axis=1) == DONE).all()
     assert results[0, :3].tolist() == [FAILED] * 3
@@ -632,7 +626,7 @@ def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(threads)
 def test_what_nobody_waits_for_any_more_is_stopped():
     stopped, late = [], threading.Event()
 
-    def attempt(scene, row, i, needed):
+    def attempt(row, i, needed):
         if i == 0:
             late.wait(10.0)
             return DONE
@@ -642,7 +636,7 @@ def test_what_nobody_waits_for_any_more_is_stopped():
         stopped.append(i)
         return None
 
-    results = in_order(np.ones((1, 3), bool), 2, lambda row: None, attempt)
+    results = in_order(np.ones((1, 3), bool), 2, attempt)
     assert (results.tolist(), stopped) == ([[DONE, UNKNOWN, UNKNOWN]], [1])
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -59,13 +59,6 @@ class TrialSetup(NamedTuple):
     gripper: Gripper
 
 
-class _Try(NamedTuple):
-    """What tries an action in the scene of a number, once, and whether the action takes the target out."""
-
-    tried: Callable[[int, Callable[[], bool]], TrialResult | None]
-    takes_target: bool
-
-
 @dataclasses.dataclass(frozen=True)
 class NativeTrials:
     """The `Trials` in C MuJoCo, of many scenes at once, on several threads.
@@ -105,79 +98,16 @@ class NativeTrials:
         self, cell: TrialSetup, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
     ) -> Int[np.ndarray, "r k"]:
         """`__call__` without a problem."""
-        config = self._motion_config(cell)
-        simulation = dataclasses.replace(self.simulation, motion=config)
+        simulation = dataclasses.replace(self.simulation, motion=self._motion_config(cell))
         actions, scenes = jax.device_get((actions, scenes))
+        near, wanted = [self.nearby.drawn(scenes, i) for i in range(1 + self.nearby.scenes)], np.asarray(wanted)
 
-        nearby = self.nearby.scenes
+        def row_of(row: int) -> _Row:
+            here, own = jax.tree.map(lambda a: np.asarray(a[row]), (near, actions))
+            return _Row(cell, simulation, self.friction, here, own, int(np.argmax(wanted[row])))
 
-        def begun(once: Once, row: int, i: int) -> _Try | TrialResult:
-            """What tries an action in the scene of a number, or its result without a trial."""
-            action: Action = jax.tree.map(lambda a: np.asarray(a[row, i]), actions)
-            kept = near_path(jax.tree.map(lambda a: a[row], scenes.objects), action, cell.gripper.approach)
-            kind = kind_of(int(action.kind))
-            motion = jax.device_get(reference_motion(kind, action, config))
-            if motion is None or not motion[1]:
-                return TrialResult.FAILED
-
-            def scene(number: int) -> tuple[World, TrialScene | None]:
-                near = self.nearby.drawn(scenes, number)
-                return once((number, kept), lambda: self._scene(cell, simulation, near, row, kept))
-
-            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (scene(0)[0], motion[0]))):
-                return TrialResult.UNKNOWN
-            index = kept.index(int(action.object)) if int(action.object) in kept else TARGET
-
-            def tried(number: int, needed: Callable[[], bool]) -> TrialResult | None:
-                attempted = lambda: _attempted(scene(number)[1], kind, motion[0], index, needed)  # noqa: E731
-                return once((i, number), lambda: attempted() if needed() else None)
-
-            return _Try(tried, kind.takes_target)
-
-        def ahead(once: Once, row: int, i: int) -> None:
-            """Try an action that is being tried in the scenes near, while it may succeed."""
-            action = begun(once, row, i)
-            if isinstance(action, TrialResult):
-                return
-
-            def promising() -> bool:
-                present = once.begun((i, 0))
-                return present is None or not present.done() or present.result() is TrialResult.SUCCEEDED
-
-            # From the other end, so that none waits for the same.
-            numbers = (1, *range(nearby, 1, -1)) if action.takes_target else (1,)
-            for number in numbers[:nearby]:
-                action.tried(number, promising)
-
-        def attempt(once: Once, row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
-            first = int(np.argmax(wanted[row]))
-            if i != first:
-                # Most often it is the first that is made: the sooner all of it is known, the better.
-                ahead(once, row, first)
-            action = begun(once, row, i) if needed() else None
-            if action is None or isinstance(action, TrialResult):
-                return action
-            result = action.tried(0, needed)
-            if result is TrialResult.SUCCEEDED and not action.takes_target:
-                # Where the arm is only held up, the search goes on.
-                harm = nearby > 0 and action.tried(1, needed) is TrialResult.HARMFUL
-                return TrialResult.UNSURE if harm else result
-            for number in range(1, 1 + nearby * (result is TrialResult.SUCCEEDED)):
-                result = action.tried(number, needed)
-                if result is not TrialResult.SUCCEEDED:
-                    return TrialResult.UNSURE if result is TrialResult.FAILED else result
-            return result
-
-        return in_order(np.asarray(wanted), self.threads or cores(), lambda row: Once(), attempt)
-
-    def _scene(
-        self, cell: TrialSetup, simulation: SimulatorConfig, scenes: TrialScenes, row: int, kept: tuple[int, ...]
-    ) -> tuple[World, TrialScene | None]:
-        """The world of a row with the kept objects, and its scene at rest; None if it cannot be built."""
-        objects = jax.tree.map(lambda a: a[row, list(kept)], scenes.objects)
-        world = jax.device_get(trial_world(cell.target, cell.shelf, objects, scenes.pose[row], scenes.found[row]))
-        friction = self.friction * float(scenes.friction[row])
-        return world, scene_at_rest(cell, simulation, world, objects, friction)
+        rows = {row: row_of(row) for row in np.flatnonzero(wanted.any(axis=1)).tolist()}
+        return in_order(wanted, self.threads or cores(), lambda row, i, needed: rows[row].attempt(i, needed))
 
     def programs(self, problem: Problem) -> list[Program]:
         """The JAX programs of trials; see `many_slots.PreparesTrials`."""
@@ -193,6 +123,130 @@ class NativeTrials:
 
     def _motion_config(self, cell: TrialSetup) -> MotionConfig:
         return dataclasses.replace(self.simulation.motion, gripper=cell.gripper)
+
+
+class _Prepared(NamedTuple):
+    """An action that can be tried.
+
+    Attributes:
+      kind: of the action.
+      reference: of the arm.
+      kept: the slots of the objects that its trials hold.
+      index: slot of the object that it moves, among these.
+    """
+
+    kind: Kind
+    reference: Reference
+    kept: tuple[int, ...]
+    index: int
+
+
+class _Row:
+    """The trials of the actions of one row; several threads may call it at once."""
+
+    def __init__(
+        self,
+        cell: TrialSetup,
+        simulation: SimulatorConfig,
+        friction: float,
+        scenes: Sequence[TrialScenes],
+        actions: Action,
+        first: int,
+    ):
+        """Args:
+        cell, simulation: of all trials.
+        friction: factor on all sliding frictions.
+        scenes: the row's scene as it is recognised, then those near it, as NumPy arrays without the leading axis.
+        actions: fields (K, ...), NumPy arrays.
+        first: the action that is made most often.
+        """
+        self._cell, self._simulation, self._friction = cell, simulation, friction
+        self._scenes, self._actions, self._first = scenes, actions, first
+        self._once = Once()
+
+    def attempt(self, i: int, needed: Callable[[], bool]) -> TrialResult | None:
+        """The result of an action, with what becomes of it in the scenes near; None if it is not needed any more."""
+        if i != self._first:
+            # The sooner all of the first is known, the better.
+            self._ahead(self._first)
+        action = self._prepared(i) if needed() else None
+        if not isinstance(action, _Prepared):
+            return action
+        result = self._tried(i, action, 0, needed)
+        if result is not TrialResult.SUCCEEDED:
+            return result
+        for number in self._near(action):
+            near = self._tried(i, action, number, needed)
+            if action.kind.takes_target and near is not TrialResult.SUCCEEDED:
+                return TrialResult.UNSURE if near is TrialResult.FAILED else near
+            # Where the arm is only held up, the search goes on.
+            if near is TrialResult.HARMFUL:
+                return TrialResult.UNSURE
+        return result
+
+    def _ahead(self, i: int) -> None:
+        """Try an action that is being tried in the scenes near, while it may succeed."""
+        action = self._prepared(i)
+        if not isinstance(action, _Prepared):
+            return
+
+        def promising() -> bool:
+            present = self._once.begun((i, 0))
+            return present is None or not present.done() or present.result() is TrialResult.SUCCEEDED
+
+        # From the other end, so that none waits for the same.
+        near = self._near(action)
+        for number in (*near[:1], *near[:0:-1]):
+            self._tried(i, action, number, promising)
+
+    def _near(self, action: _Prepared) -> range:
+        """The numbers of the scenes near in which an action is tried."""
+        count = len(self._scenes)
+        return range(1, count if action.kind.takes_target else min(count, 2))
+
+    def _prepared(self, i: int) -> _Prepared | TrialResult:
+        """An action that can be tried, or its result without a trial."""
+
+        def prepare() -> _Prepared | TrialResult:
+            action: Action = jax.tree.map(lambda a: a[i], self._actions)
+            kind, index = kind_of(int(action.kind)), int(action.object)
+            motion = jax.device_get(reference_motion(kind, action, self._simulation.motion))
+            if motion is None or not motion[1]:
+                return TrialResult.FAILED
+            kept = near_path(self._scenes[0].objects, action, self._cell.gripper.approach)
+            if not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (self._scene(0, kept)[0], motion[0]))):
+                return TrialResult.UNKNOWN
+            return _Prepared(kind, motion[0], kept, kept.index(index) if index in kept else TARGET)
+
+        return self._once(i, prepare)
+
+    def _tried(self, i: int, action: _Prepared, number: int, needed: Callable[[], bool]) -> TrialResult | None:
+        """The result of an action in the scene of a number; None if it is not needed any more."""
+
+        def attempt() -> TrialResult | None:
+            if not needed():
+                return None
+            scene = self._scene(number, action.kept)[1]
+            if scene is None:
+                return TrialResult.UNKNOWN
+            try:
+                return scene.attempt(action.kind, action.reference, action.index, needed)
+            except mujoco.FatalError:
+                return TrialResult.UNKNOWN
+
+        return self._once((i, number), attempt)
+
+    def _scene(self, number: int, kept: tuple[int, ...]) -> tuple[World, TrialScene | None]:
+        """The world of a number with the kept objects, and its scene at rest; None if it cannot be built."""
+
+        def made() -> tuple[World, TrialScene | None]:
+            cell, near = self._cell, self._scenes[number]
+            objects = jax.tree.map(lambda a: a[list(kept)], near.objects)
+            world = jax.device_get(trial_world(cell.target, cell.shelf, objects, near.pose, near.found))
+            friction = self._friction * float(near.friction)
+            return world, scene_at_rest(cell, self._simulation, world, objects, friction)
+
+        return self._once((number, kept), made)
 
 
 def near_path(objects: Superquadrics, action: Action, approach: float) -> tuple[int, ...]:
@@ -215,18 +269,6 @@ def near_path(objects: Superquadrics, action: Action, approach: float) -> tuple[
     apart[int(action.object) : int(action.object) + 1] = -np.inf
     nearest = np.argsort(np.where(objects.valid, apart, np.inf), kind="stable")[:TARGET]
     return tuple(sorted(nearest.tolist()))
-
-
-def _attempted(
-    scene: TrialScene | None, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
-) -> TrialResult | None:
-    """The result of an action in a scene; see `TrialScene.attempt`."""
-    if scene is None:
-        return TrialResult.UNKNOWN
-    try:
-        return scene.attempt(kind, reference, index, needed)
-    except mujoco.FatalError:
-        return TrialResult.UNKNOWN
 
 
 @cached_jit(on_host=True)

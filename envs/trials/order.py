@@ -5,19 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from mechsearch_jax.planner.trials import TrialResult
 
-Scene = TypeVar("Scene")
-# Threads for each scene: the more trials run, the longer each waits for Python's lock, and the first mostly decides.
+# Threads for each row: the more trials run, the longer each waits for Python's lock, and the first mostly decides.
 # One alone takes 75 ms on an H200's host, beside three others 109, beside seven 135.
 THREADS = 2
-# Tries column i of row r in its scene; returns None if `needed` turns False meanwhile.
-Attempt = Callable[[Scene, int, int, Callable[[], bool]], TrialResult | None]
+# Tries a column of a row; returns None if `needed` turns False meanwhile.
+Attempt = Callable[[int, int, Callable[[], bool]], TrialResult | None]
 
 
 class Once:
@@ -43,28 +42,22 @@ class Once:
         return future.result()
 
 
-class _Row(Generic[Scene]):
-    """The state of a scene's trials.
+class _Row:
+    """The state of a row's trials.
 
     Attributes:
       left: columns that no thread has begun, in order.
       begun: number of columns that were begun.
       first: the first column that has succeeded so far; the number of columns if none has.
-      lock: held while the scene is made.
-      scene: holds the scene once it is made; empty before.
     """
 
     def __init__(self, wanted: Bool[np.ndarray, " k"]):
         self.left = np.flatnonzero(wanted).tolist()
         self.begun = 0
         self.first = len(wanted)
-        self.lock = threading.Lock()
-        self.scene: list[Scene] = []
 
 
-def in_order(
-    wanted: Bool[np.ndarray, "n k"], threads: int, make: Callable[[int], Scene], attempt: Attempt[Scene]
-) -> Int[np.ndarray, "n k"]:
+def in_order(wanted: Bool[np.ndarray, "n k"], threads: int, attempt: Attempt) -> Int[np.ndarray, "n k"]:
     """The results of the wanted trials of each row, as `TrialResult`, up to the row's first success.
 
     Threads take the first column of every row, then the next column of rows without a success, and so on. An idle
@@ -74,11 +67,10 @@ def in_order(
     Args:
       wanted: the trials to run, the best column first.
       threads: largest number of trials that run at the same time; at most `THREADS` for each row.
-      make: makes the scene of a row; called once, in a thread.
       attempt: runs a trial; called in a thread.
     """
     results = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
-    rows: dict[int, _Row[Scene]] = {int(r): _Row(wanted[r]) for r in np.flatnonzero(wanted.any(axis=1))}
+    rows = {int(r): _Row(wanted[r]) for r in np.flatnonzero(wanted.any(axis=1))}
     lock = threading.Lock()
 
     def next_trial() -> tuple[int, int] | None:
@@ -94,10 +86,7 @@ def in_order(
         while (trial := next_trial()) is not None:
             r, i = trial
             row = rows[r]
-            with row.lock:
-                if not row.scene:
-                    row.scene.append(make(r))
-            result = attempt(row.scene[0], r, i, lambda row=row, i=i: i < row.first)
+            result = attempt(r, i, lambda row=row, i=i: i < row.first)
             if result is None:
                 continue
             results[r, i] = result
