@@ -53,14 +53,12 @@ class Layout:
       beside: the bystander's view.
       above: the shelf from above.
       view: the camera's view.
-      clock: the time.
     """
 
     size: tuple[int, int]
     beside: tuple[int, int, int, int]
     above: tuple[int, int, int, int]
     view: tuple[int, int, int, int]
-    clock: tuple[int, int, int, int]
 
     @classmethod
     def of(cls, width: int, camera: Camera, shelf: Shelf, room: float) -> Layout:
@@ -81,7 +79,6 @@ class Layout:
             part(_GAP, _FOOTER, _LEFT, high),
             part(across, _FOOTER + view + _BETWEEN, column, above),
             part(across, _FOOTER, column, view),
-            part(WIDTH - 1.0, _FOOTER + high, 1.0, _HEADER),
         )
 
 
@@ -133,11 +130,11 @@ class Page:
         self._clock.set_text(f"{moving.time:.1f} s")
         self._draw(self._background, [*self._movers.hand(moving.hand), self._clock])
         image = self._image.copy()
-        for left, bottom, width, height in (self._layout.above, self._layout.clock):
-            part = slice(len(image) - bottom - height, len(image) - bottom), slice(left, left + width)
-            image[part] = self._pixels[part]
         x, y, w, h = self._layout.beside
         top = len(image) - y - h
+        # All that moves is beside the bystander's view and not below the shelf from above.
+        part = slice(len(image) - self._layout.above[1]), slice(x + w, None)
+        image[part] = self._pixels[part]
         image[top : top + h, x : x + w] = beside
         return image
 
@@ -201,7 +198,7 @@ class _Movers:
         """The artists of the fingers and the hand."""
         for polygon, points in zip(self._hand, hand, strict=True):
             polygon.set_xy(drawing.hull(sketches.from_above(points)))
-        return [*self._hand]
+        return list[Artist](self._hand)
 
 
 def _far(
