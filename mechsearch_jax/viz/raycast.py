@@ -231,7 +231,7 @@ class Eye:
         there = rows[0] <= rows[1]
         first = np.where(there, columns, np.inf).min(axis=(0, 2))
         end = np.where(there, columns, -np.inf).max(axis=(0, 2))
-        some, every = (each[:, None] for each in (ahead.any(axis=1), ahead.all(axis=1)))
+        some, every = ahead.any(axis=1, keepdims=True), ahead.all(axis=1, keepdims=True)
         first, end = np.where(every, np.floor(first), 0.0), np.where(every, np.ceil(end), self._width * some)
         columns = (np.clip(column, 0, self._width).astype(int) for column in (first, end))
         return [np.repeat(column, BAND, axis=1)[:, : self._height] for column in columns]
