@@ -132,9 +132,8 @@ class Page:
         image = self._image.copy()
         x, y, w, h = self._layout.beside
         top = len(image) - y - h
-        # All that moves is beside the bystander's view and not below the shelf from above.
-        part = slice(len(image) - self._layout.above[1]), slice(x + w, None)
-        image[part] = self._pixels[part]
+        # Whatever moves is to the right of the bystander's view.
+        image[:, x + w :] = self._pixels[:, x + w :]
         image[top : top + h, x : x + w] = beside
         return image
 
