@@ -33,7 +33,7 @@ class Polyhedron(Surface):
     planes: Float[np.ndarray, "n 4"]
 
     def cut(
-        self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
+        self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, "3 *#rays"], library: Any
     ) -> Float[Any, "*rays"]:
         near, far = library.full_like(direction[0], np.inf), library.full_like(direction[0], 0.0)
         for *normal, offset in self.planes.tolist():

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import collections
-import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 
+import loky
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -20,12 +20,11 @@ from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.runtime.cores import cores
-from mechsearch_jax.runtime.workers import workers
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.film import Layout, Moving, Page
 from mechsearch_jax.viz.panda import panda_solids
-from mechsearch_jax.viz.raycast import Eye, Picture, VisibleSolid
+from mechsearch_jax.viz.raycast import Eye, VisibleSolid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -37,7 +36,7 @@ LEFT_OUT = ("ceiling", "left")
 VIEW_ANGLE = 1.02
 # Pictures that a process draws at once; the most processes, which keep up with the rest of the film; and pictures that
 # take as long as a process takes to start.
-LOT, MOST, EACH = 8, 4, 100
+LOT, MOST, EACH = 24, 4, 50
 
 
 class Film:
@@ -85,7 +84,9 @@ class Film:
         """The bystander's view of rows, in order; of many in several processes, a little ahead of who takes them."""
         played = self._played
         shown = [body_solids(step.world) for step in self._recording.steps]
-        draw = functools.partial(_drawn, self._recording.shelf, *self._layout.beside[2:])
+        shelf = self._recording.shelf
+        eye = Eye(bystander(shelf, *self._layout.beside[2:]), LIGHT, AMBIENT, BACKGROUND_COLOUR)
+        empty = eye.picture(shelf_solids(shelf).values())
 
         def solids(row: int) -> list[VisibleSolid]:
             bodies = [
@@ -99,34 +100,19 @@ class Film:
         processes = min(cores(), MOST, len(rows) // EACH)
         if processes < 2:
             for lot in lots:
-                yield from draw([solids(row) for row in lot])
+                yield from eye.images(map(solids, lot), empty)
             return
-        pool = workers(processes)
+        pool = loky.ProcessPoolExecutor(processes, env={"OPENBLAS_NUM_THREADS": "1"})
         begun: collections.deque[Future[list[UInt8[np.ndarray, "h w 3"]]]] = collections.deque()
         try:
             for lot in lots:
-                begun.append(pool.submit(draw, [solids(row) for row in lot]))
+                begun.append(pool.submit(eye.images, [solids(row) for row in lot], empty))
                 if len(begun) > 2 * processes:
                     yield from begun.popleft().result()
             for lot in begun:
                 yield from lot.result()
         finally:
             pool.shutdown(kill_workers=True)
-
-
-def _drawn(
-    shelf: Shelf, width: int, height: int, pictures: Sequence[Sequence[VisibleSolid]]
-) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Pictures of solids before the shelf."""
-    eye, empty = _scenery(shelf, width, height)
-    return [eye.picture(solids, empty).pixels for solids in pictures]
-
-
-@functools.lru_cache(1)
-def _scenery(shelf: Shelf, width: int, height: int) -> tuple[Eye, Picture]:
-    """The bystander's eye, and what it sees of a shelf that is empty."""
-    eye = Eye(bystander(shelf, width, height), LIGHT, AMBIENT, BACKGROUND_COLOUR)
-    return eye, eye.picture(list(shelf_solids(shelf).values()))
 
 
 def bystander(shelf: Shelf, width: int, height: int) -> Camera:

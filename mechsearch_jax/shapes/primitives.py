@@ -39,7 +39,7 @@ class Surface(abc.ABC):
         self,
         origin: Sequence[Float[Any, "*#rays"]],
         direction: Sequence[Float[Any, "*#rays"]],
-        half_size: Float[Any, " 3"],
+        half_size: Float[Any, "3 *#rays"],
         library: Any,
     ) -> Float[Any, "*rays"]:
         """Where rays from outside enter it; infinite for misses, also if it is behind them.
@@ -47,7 +47,7 @@ class Surface(abc.ABC):
         Args:
           origin: of the rays, by component [m].
           direction: of any length, by component.
-          half_size: [m].
+          half_size: [m]; the same for all rays, or one for each.
           library: of the arrays.
 
         Returns:
@@ -193,7 +193,7 @@ class Shape(Primitive):
 
 
 def slab(
-    origin: Float[Any, "..."], direction: Float[Any, "..."], half: Float[Any, ""], library: Any
+    origin: Float[Any, "..."], direction: Float[Any, "..."], half: Float[Any, "..."], library: Any
 ) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
     """Where rays enter and leave the slab between two planes at `-half` and `half`."""
     safe = library.where(library.abs(direction) < 1e-12, 1e-12, direction)

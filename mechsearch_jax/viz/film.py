@@ -6,8 +6,8 @@ The static parts are drawn once per step, by the functions of the filmstrip, and
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -25,6 +25,8 @@ from mechsearch_jax.workspace.target import Target
 
 # Of the picture [inches].
 WIDTH = 8.0
+# Bodies that are less far from where they were drawn are not drawn again [m].
+STILL = 1e-5
 _GAP, _LEFT, _HEADER, _FOOTER, _BETWEEN = 0.08, 4.8, 0.56, 0.44, 0.05
 
 
@@ -110,7 +112,9 @@ class Page:
         self._movers = _Movers(self._above, frame)
         self._clock = self._text(width - _GAP * width / WIDTH, 0.2, "", 8.5, drawing.MUTED, ha="right", animated=True)
         self._canvas.draw()
-        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        self._empty, self._image = self._canvas.copy_from_bbox(self._figure.bbox), self._pixels.copy()
+        self._bodies: Sequence[Float[np.ndarray, "points 3"] | None] | None = None
 
     def image(self, beside: UInt8[np.ndarray, "h w 3"], moving: Moving) -> UInt8[np.ndarray, "rows columns 3"]:
         """The whole image at one moment.
@@ -119,15 +123,24 @@ class Page:
           beside: the bystander's view, of the layout's size.
           moving: the moving parts.
         """
-        self._canvas.restore_region(self._background)
+        if self._bodies is None or _far(self._bodies, moving.bodies):
+            self._draw(self._empty, self._movers.bodies(moving.bodies))
+            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+            self._bodies = moving.bodies
         self._clock.set_text(f"{moving.time:.1f} s")
-        for artist in (*self._movers.at(moving), self._clock):
-            self._figure.draw_artist(artist)
-        image = np.array(self._canvas.buffer_rgba())[..., :3]
+        self._draw(self._background, [*self._movers.hand(moving.hand), self._clock])
+        image = self._image.copy()
         x, y, w, h = self._layout.beside
         top = len(image) - y - h
+        # Whatever moves is to the right of the bystander's view.
+        image[:, x + w :] = self._pixels[:, x + w :]
         image[top : top + h, x : x + w] = beside
         return image
+
+    def _draw(self, background: Any, artists: Iterable[Artist]) -> None:
+        self._canvas.restore_region(background)
+        for artist in artists:
+            self._figure.draw_artist(artist)
 
     def _write(self, frame: Frame) -> None:
         left, size = _GAP * self._layout.size[0] / WIDTH, 72.0 * (WIDTH - 1.0)
@@ -158,9 +171,9 @@ class _Movers:
         self._axes.add_patch(polygon)
         return polygon
 
-    def at(self, moving: Moving) -> list[Artist]:
-        """The artists of a moment, from back to front."""
-        *objects, target = moving.bodies
+    def bodies(self, bodies: Sequence[Float[np.ndarray, "points 3"] | None]) -> list[Artist]:
+        """The artists of the bodies, from back to front."""
+        *objects, target = bodies
         while len(self._bodies) < len(objects):
             number = drawing.number(self._axes, (0.0, 0.0), len(self._bodies), animated=True)
             self._bodies.append((self._polygon(drawing.OBJECT, 0.22, 1.3), number))
@@ -178,6 +191,17 @@ class _Movers:
             if number is not None:
                 number.set_position((outline.min(axis=0) + outline.max(axis=0)) / 2)  # pyright: ignore
                 shown.append(number)
-        for polygon, points in zip(self._hand, moving.hand, strict=True):
+        return shown
+
+    def hand(self, hand: Sequence[Float[np.ndarray, "points 3"]]) -> list[Artist]:
+        """The artists of the fingers and the hand."""
+        for polygon, points in zip(self._hand, hand, strict=True):
             polygon.set_xy(drawing.hull(sketches.from_above(points)))
-        return [*shown, *self._hand]
+        return list[Artist](self._hand)
+
+
+def _far(
+    before: Sequence[Float[np.ndarray, "points 3"] | None], after: Sequence[Float[np.ndarray, "points 3"] | None]
+) -> bool:
+    """Whether a body is elsewhere, of the same ones."""
+    return any(b is not None and np.abs(b - a).max() > STILL for a, b in zip(before, after, strict=True))
