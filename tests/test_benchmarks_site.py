@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from stored_rows import row_of
 
-from mechsearch_jax.benchmarks.lab.site import gallery, method_pictures, network_pages, set_pictures, store_run
+from mechsearch_jax.benchmarks.lab.site import gallery, network_pages, pictures, set_pictures, store_run
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.preset_names import settings_of
 from mechsearch_jax.benchmarks.store.rows import episode_key
@@ -26,7 +26,8 @@ from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, recorded
 from mechsearch_jax.networks.weights import ARCHITECTURES
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.runtime.versions import DECISION_VERSION
+from mechsearch_jax.workspace.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs/scene-sets"
@@ -63,12 +64,26 @@ def test_pictures_are_of_sets_alone_that_may_be_looked_at():
     assert "report" not in SHOWN
 
 
-@pytest.mark.parametrize("name", method_pictures.PICTURES)
-def test_the_pictures_of_the_method_are_of_the_shipped_scene(name):
-    with Image.open(ROOT / method_pictures.OUT / f"{name}.png") as picture:
-        shows = picture.text[method_pictures.SHOWS]
-    today = load_scenario(example_scenarios()[method_pictures.SCENE]).content_hash
-    assert shows == today, f"run `python -m {method_pictures.__name__}`"
+DRAW_PICTURES = f"run `python -m {pictures.__name__}`"
+SEARCHED = json.loads((ROOT / pictures.OUT / pictures.RECORD).read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", pictures.SEARCHES)
+def test_the_pictures_are_of_searches_by_the_decisions_of_today(name):
+    scene = load_scenario(find_scenario(pictures.SEARCHES[name][0])).content_hash
+    assert (SEARCHED[name]["scene"], SEARCHED[name]["decisions"]) == (scene, DECISION_VERSION), DRAW_PICTURES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", pictures.SEARCHES)
+def test_a_search_ends_today_as_its_pictures_say(name, tmp_path):
+    folder = pictures.search(name, tmp_path)
+    assert pictures.record_of(folder) == SEARCHED[name], DRAW_PICTURES
+
+
+@pytest.mark.parametrize("name", pictures.METHOD)
+def test_the_pictures_of_the_method_are_shown(name):
+    assert (ROOT / pictures.OUT / pictures.RECORD.parent / f"{name}.png").is_file(), DRAW_PICTURES
     assert f"](pictures/{name}.png)" in (ROOT / "docs/pictures.md").read_text(encoding="utf-8")
 
 

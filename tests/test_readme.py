@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mechsearch_jax.benchmarks.lab.site.first_picture import OUT
 from mechsearch_jax.workspace.scenario import example_scenarios
 
 ROOT = Path(__file__).parents[1]
@@ -38,9 +37,9 @@ def test_the_first_screen_moves():
 
 
 def test_the_command_that_made_the_animation_is_beside_it():
-    (module,) = re.findall(r"`python -m (\S+first_picture)`", README)
+    (module,) = re.findall(r"`python -m (\S+pictures)`", README)
     assert importlib.util.find_spec(module)
-    assert f"]({OUT})" in README
+    assert "](docs/search.webp)" in README
 
 
 @pytest.mark.slow

@@ -1,21 +1,27 @@
-"""Draws the pictures of docs/pictures.md: `python -m mechsearch_jax.benchmarks.lab.site.method_pictures` in a checkout.
+"""Draws the pictures of the docs: `python -m mechsearch_jax.benchmarks.lab.site.pictures` in a checkout.
 
-They show one search of a shipped scene, which runs first, and what recognition makes of the shipped images.
+Each search of `SEARCHES` runs first, as a user would run it. `searches.json` beside the pictures keeps which scene it
+was, by which decisions, and how it ended, so that a test can tell whether a picture shows what a search does today.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
@@ -24,27 +30,85 @@ from matplotlib.patches import Polygon
 
 import mechsearch_jax as ms
 from mechsearch_jax.actions import kind_of
+from mechsearch_jax.benchmarks.lab.site import gallery, set_pictures
+from mechsearch_jax.envs.recording.film import Film
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.recording import NAME, RecordedStep, Recording, load_recording
+from mechsearch_jax.envs.scenes import household_pictures
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import replacing
+from mechsearch_jax.runtime.versions import DECISION_VERSION
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.filmstrip import draw_believed
 from mechsearch_jax.viz.maps import Maps, maps_figure
-from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.viz.movie import save_movie
+from mechsearch_jax.workspace.scenario import load_scenario
 
-SCENE = "crowded-shelf"
-OUT = Path("docs/pictures")
-# Key of the PNG's text with the content hash of the scene.
-SHOWS = "scene"
+OUT = Path("docs")
+# What the searches of the pictures were, beside those of the method.
+RECORD = Path("pictures/searches.json")
+# The arguments of `mechsearch search` of each search.
+SEARCHES: Mapping[str, tuple[str, ...]] = {
+    "first-light": ("first-light",),
+    "crowded-shelf": ("crowded-shelf",),
+    "planner": ("development-6-017",),
+    "random": ("development-6-017", "--policy", "random"),
+}
+# What is written above the two films of the animation, by their search.
+FILMS: Mapping[str, str] = {"planner": "search-for-grasp", "random": "random actions, the same scene"}
+# Of the films: width [pixels], pictures in a second, how many times as fast as it was, and height of a title [inches].
+WIDTH, FPS, SPEED, TITLE = 720, 8, 5.0, 0.3
 # Steps of the search that are shown, at most, and the width of one [inch].
 STEPS, _WIDTH = 6, 3.6
+_PROGRAM = (sys.executable, "-m", "mechsearch_jax.commands.main")
+
+Picture = UInt8[np.ndarray, "h w 3"]
 
 
-def search(folder: Path) -> Recording:
-    """Search the scene, as a user would, and read the recording."""
-    program = (sys.executable, "-m", "mechsearch_jax.commands.main")
-    subprocess.run([*program, "search", SCENE, "--out", str(folder), "--record"], check=True)
-    return load_recording(folder / NAME)
+def search(name: str, recordings: Path) -> Path:
+    """The folder of a search, which runs unless its recording is there.
+
+    Raises:
+      InputError: the search fails.
+    """
+    folder, command = recordings / name, ("search", *SEARCHES[name], "--out", str(recordings / name), "--record")
+    if not (folder / NAME).is_file() and (code := subprocess.run([*_PROGRAM, *command]).returncode):
+        raise InputError(f"mechsearch {' '.join(command)} ended with {code}")
+    return folder
+
+
+def record_of(folder: Path) -> dict[str, Any]:
+    """What `RECORD` keeps of a search."""
+    scene = load_scenario(folder / "scenario.json").content_hash
+    return {"scene": scene, "decisions": DECISION_VERSION, "ended": load_recording(folder / NAME).heading}
+
+
+class Pictures(Protocol):
+    """A film: its size and its pictures."""
+
+    size: tuple[int, int]
+
+    def __iter__(self) -> Iterator[Picture]: ...
+
+
+def both(films: Sequence[Pictures], titles: Sequence[str]) -> Iterator[Picture]:
+    """Pictures of films one above the other; one that has ended stands still."""
+    last: list[Picture] = []
+    strips = [title_strip(title, film.size[0]) for title, film in zip(titles, films, strict=True)]
+    for pictures in itertools.zip_longest(*films):
+        last = [new if new is not None else last[i] for i, new in enumerate(pictures)]
+        yield np.concatenate([part for strip, picture in zip(strips, last, strict=True) for part in (strip, picture)])
+
+
+def title_strip(text: str, width: int) -> Picture:
+    """A line of text as a picture, of an even height."""
+    dots = width / 8.0
+    height = round(TITLE * dots / 2) * 2
+    figure = Figure(figsize=(8.0, height / dots), dpi=dots, facecolor=drawing.PAPER)
+    canvas = FigureCanvasAgg(figure)
+    figure.text(0.01, 0.45, text, fontsize=13, weight="bold", color=drawing.ACTION, va="center")
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[:height, :width, :3]
 
 
 def maps(recording: Recording) -> Figure:
@@ -140,7 +204,8 @@ def steps(recording: Recording) -> Figure:
     return figure
 
 
-PICTURES: dict[str, Callable[[Recording], Figure]] = {
+# Of the search of `crowded-shelf`, in docs/pictures.
+METHOD: Mapping[str, Callable[[Recording], Figure]] = {
     "recognition": lambda recording: recognition(),
     "maps": maps,
     "sampled": sampled,
@@ -148,20 +213,59 @@ PICTURES: dict[str, Callable[[Recording], Figure]] = {
 }
 
 
-def main() -> None:
-    """Draw all pictures."""
-    parser = argparse.ArgumentParser(description=f"Draw the pictures of {OUT}.")
-    parser.add_argument("--out", default=OUT, type=Path, help="folder of the pictures")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        recording = search(Path(folder))
-    if len(recording.steps) > STEPS:
-        print(f"steps.png shows the first {STEPS} of {len(recording.steps)} steps, and says so")
-    shows = load_scenario(example_scenarios()[SCENE]).content_hash
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, draw in PICTURES.items():
-        with replacing(arguments.out / f"{name}.png") as file:
-            draw(recording).savefig(file, format="png", dpi=110, metadata={SHOWS: shows})
+def draw_searches(out: Path, recordings: Path) -> None:
+    """Draw the animation, the filmstrip of the first example and the pictures of the method, and keep `RECORD`.
+
+    Raises:
+      InputError: a search fails, or a file cannot be written.
+    """
+    folders = {name: search(name, recordings) for name in SEARCHES}
+    (out / RECORD).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(folders["first-light"] / "filmstrip.png", out / "filmstrip.png")
+    recording = load_recording(folders["crowded-shelf"] / NAME)
+    for name, draw in METHOD.items():
+        with replacing(out / RECORD.parent / f"{name}.png") as file:
+            draw(recording).savefig(file, format="png", dpi=110)
+    films = [Film(load_recording(folders[name] / NAME), WIDTH, FPS, SPEED) for name in FILMS]
+    save_movie(both(films, list(FILMS.values())), out / "search.webp", FPS)
+    with replacing(out / RECORD) as file:
+        file.write(
+            (json.dumps({name: record_of(folder) for name, folder in folders.items()}, indent=1) + "\n").encode()
+        )
+
+
+def draw_scenes(out: Path, recordings: Path) -> None:
+    """Draw the household catalogue and what the pages of scene sets name."""
+    household_pictures.draw(out / "household-things.png")
+    set_pictures.main([])
+
+
+def draw_gallery(out: Path, recordings: Path) -> None:
+    """Write the gallery's pages."""
+    gallery.main(["--out", str(out / "gallery"), "--recordings", str(recordings)])
+
+
+PARTS: Mapping[str, Callable[[Path, Path], None]] = {
+    "searches": draw_searches,
+    "gallery": draw_gallery,
+    "scenes": draw_scenes,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Draw all pictures, or some."""
+    parser = argparse.ArgumentParser(description="At the root of a checkout: search anew, and draw the docs' pictures.")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all of them without")
+    parser.add_argument("--recordings", type=Path, help="keep the recordings here, and use those that are there")
+    given = parser.parse_args(arguments)
+    if unknown := [part for part in given.parts if part not in PARTS]:
+        parser.error(f"{unknown[0]}: is no part; there are {', '.join(PARTS)}")
+    try:
+        with tempfile.TemporaryDirectory() as fresh:
+            for part in given.parts or PARTS:
+                PARTS[part](OUT, (given.recordings or Path(fresh)) / part)
+    except InputError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":
