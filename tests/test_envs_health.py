@@ -134,6 +134,12 @@ def test_a_package_that_is_missing_breaks_the_main_job(monkeypatch):
     assert (broken.state, broken.remedy) == (State.BROKEN, "pip install no-such-package")
 
 
+def test_releases_of_mujoco_that_do_not_go_together_are_told(monkeypatch):
+    monkeypatch.setattr(health, "_version", lambda name: "4.0.0" if name == "mujoco" else "3.17.0")
+    doubtful = findings_of("versions")[-1]
+    assert (doubtful.state, doubtful.remedy) == (State.DOUBTFUL, "pip install mujoco==3.17.0")
+
+
 @pytest.mark.parametrize(("state", "status"), [(State.MISSING, None), (State.BROKEN, 1)])
 def test_the_status_says_whether_the_main_job_runs(monkeypatch, capsys, state, status):
     def check():

@@ -116,6 +116,10 @@ def _versions() -> Iterator[Finding]:
     for name in PACKAGES:
         if not versions[name]:
             yield Finding("versions", State.BROKEN, f"{name} is not installed", f"pip install {name}")
+    mujoco, mjx = _version("mujoco"), _version("mujoco-mjx")
+    if mujoco and mjx and mujoco.split(".")[:2] != mjx.split(".")[:2]:
+        says = f"mujoco {mujoco} and mujoco-mjx {mjx} are not of one release: batches may fail, or step otherwise"
+        yield Finding("versions", State.DOUBTFUL, says, f"pip install mujoco=={mjx}")
 
 
 def _version(name: str) -> str:
