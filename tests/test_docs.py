@@ -193,7 +193,7 @@ def unseen_line(run, objects, **settings):
 
 
 def test_the_rates_of_the_readme_are_the_stored_ones():
-    run = load_run(RESULTS / "runs", "report-i-h200")
+    run = load_run(RESULTS / "runs", "report-h200")
     header = " | ".join(f"{seen}: found | graspable | retrieved" for seen in ("true shapes", "`full`"))
     stated = {row[0]: row[1:] for row in rows("README.md", f"| objects | {header} |")}
     assert list(stated) == ["2", "4", "6", "8"]
@@ -210,7 +210,7 @@ def test_the_rates_of_the_readme_are_the_stored_ones():
 
 def test_the_other_figures_of_the_readme_are_the_stored_ones():
     text = read("README.md")
-    seconds = json.loads((RESULTS / "plan-farther-sides-trials-cpu.json").read_text())["median_seconds"]
+    seconds = json.loads((RESULTS / "plan-trials-cpu.json").read_text())["median_seconds"]
     assert f"[{1000 * seconds:.0f} ms on two CPU cores]" in text
     things, assumed, drawn = (
         unseen_line(load_run(RESULTS / "runs", f"report-{name}-h200"), 8, **settings)["retrieved"]["rate"]

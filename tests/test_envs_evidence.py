@@ -9,8 +9,8 @@ import pytest
 from recordings import EPISODE, LOST, OBJECTS, PUSH, RECORDING, SEQUENCES, SLOTS, stacked
 
 from mechsearch_jax.envs.episode.numbering import named_tried
-from mechsearch_jax.envs.known_target.in_the_way import blocking, least_sets
 from mechsearch_jax.envs.recording.evidence import Forecasts, foreseen_rows
+from mechsearch_jax.envs.recording.in_the_way import blocking, least_sets
 from mechsearch_jax.envs.recording.recording import NAME, load_recording, save_recording
 from mechsearch_jax.envs.recording.sampled import Sampled
 from mechsearch_jax.observation import Observation

@@ -6,7 +6,6 @@ from mechsearch_jax.actions.kinds.object_grasps import BoxGrasp, ObjectGraspConf
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.dynamics.learned import LearnedPush
 from mechsearch_jax.envs.cell.simulated_cell import SensorNoise
-from mechsearch_jax.envs.known_target.search import KnownSearchConfig
 from mechsearch_jax.envs.pushing.pushes import Generation
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
@@ -39,7 +38,6 @@ IMPOSSIBLE = (
     (LearnedPush, "likely .* max_penetration", {"likely": 1.5}, {"likely": NAN}, {"max_penetration": -0.01}),
     (PushConfig, None, {"width": 0}, {"layers": 0}, {"frame": "gripper"}),
     (SensorNoise, "missing a share below 1", {"missing": 1.0}),
-    (KnownSearchConfig, None, {"simulated": 0}, {"worlds": 0}, {"rounds": 0}, {"grasps": 0}, {"max_steps": 0}),
     (MjxConfig, None, {"contacts": 0}, {"rows": 0}, {"compound_contacts": 0}, {"compound_rows": 0}),
     (SimulatorConfig, None, {"tracking_bound": 0}, {"settle_steps": -1.0}, {"slip": NAN}),
     (MotionConfig, "must be positive", {"timestep": 0.0}),

@@ -5,13 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.lab import PROGRAM
-from mechsearch_jax.benchmarks.lab.commands import episodes, quality
-from mechsearch_jax.commands.main import Commands, call_of, run
-
-COMMANDS: Commands = {
-    **quality.COMMANDS,
-    **episodes.COMMANDS,
-}
+from mechsearch_jax.benchmarks.lab.commands import quality
+from mechsearch_jax.commands.main import call_of, run
 
 
 def parse(arguments: Sequence[str]) -> Callable[[], None]:
@@ -21,7 +16,7 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
       InputError: the arguments are wrong.
       SystemExit: after help was printed.
     """
-    return call_of(PROGRAM, "Measure the parts, one command each.", COMMANDS, arguments)
+    return call_of(PROGRAM, "Measure the parts, one command each.", quality.COMMANDS, arguments)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.endings import events, in_words, verdict
 from mechsearch_jax.envs.episode.episode_log import target_trouble
 from mechsearch_jax.envs.episode.records import Step
-from mechsearch_jax.envs.known_target.in_the_way import blocking, least_sets, objects_in_words
+from mechsearch_jax.envs.recording.in_the_way import blocking, least_sets, objects_in_words
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.observation import Observation

@@ -25,6 +25,7 @@ def main():
     parser.add_argument("--force", type=float, help="on the hand at which the arm stops [N]; each motion's own bound")
     parser.add_argument("--film", action="store_true", help="draw the images of lost searches")
     parser.add_argument("--report", action="store_true", help="only print what there is")
+    parser.add_argument("--store", type=Path, help="also write what came of them to this JSON file, beside others")
     given = parser.parse_args()
     rows, what = given.out / "rows", (given.target, given.arm)
     rows.mkdir(parents=True, exist_ok=True)
@@ -45,6 +46,10 @@ def main():
     kept = [json.loads(path.read_text()) for path in sorted(rows.glob(f"{given.target}-{given.arm}-*.json"))]
     print(summary.table(kept))
     (given.out / f"summary-{given.target}-{given.arm}.md").write_text(summary.table(kept) + "\n")
+    if given.store:
+        told = json.loads(given.store.read_text()) if given.store.exists() else {"searches": {}}
+        told["searches"][f"{given.target} on {given.arm}"] = summary.stored(kept)
+        given.store.write_text(json.dumps(told, indent=1) + "\n")
 
 
 if __name__ == "__main__":

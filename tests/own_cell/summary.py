@@ -16,14 +16,14 @@ def wilson(hits, of, z=1.96):
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
-def table(rows):
-    """Counts of searches, looks and motions, and the reason of each that was lost, as Markdown."""
+def counts(rows):
+    """What is counted of searches, looks and motions: name, how many, of how many, and what is wanted."""
     steps = [step for row in rows for step in row["steps"]]
     motions = [step for step in steps if "executed" in step]
     searches_with = lambda test: sum(any(test(step) for step in row["steps"]) for row in rows)  # noqa: E731
     dropped = lambda step: "target" in step.get("executed", {}).get("dropped", {})  # noqa: E731
     refused = [step for step in steps if "executed" not in step]
-    counts = [
+    return [
         ("retrieved", sum(row["retrieved"] for row in rows), len(rows), "at least 36 of 40"),
         ("searches in which the held target was dropped", searches_with(dropped), len(rows), "0"),
         ("motions without expected gain", sum(step["without_gain"] for step in motions), len(motions), "0"),
@@ -40,8 +40,12 @@ def table(rows):
         ("grasps failed with a thing between the fingers", sum(_wrong(step) for step in motions), len(motions), ""),
         ("motions stopped by the controller", sum(_stopped(step) for step in motions), len(motions), ""),
     ]
+
+
+def table(rows):
+    """The counts, and the reason of each search that was lost, as Markdown."""
     lines = ["| | count | of | 95% interval | wanted |", "|---|---|---|---|---|"]
-    for name, hits, of, wanted in counts:
+    for name, hits, of, wanted in counts(rows):
         low, high = wilson(hits, of)
         lines.append(f"| {name} | {hits} | {of} | {100 * low:.0f} to {100 * high:.0f}% | {wanted} |")
     touched = sorted(
@@ -63,6 +67,23 @@ def table(rows):
             f"{row.get('seconds', '')} | {'' if row['retrieved'] else '**lost** '}{row['why'][:300]} |"
         )
     return "\n".join(lines)
+
+
+def stored(rows):
+    """The searches of one target and arm for a stored file: their counts, and a line for each."""
+    layouts = sorted({row["layout"] for row in rows})
+    return {
+        "target": rows[0]["target"],
+        "arm": rows[0]["arm"],
+        "layouts": [layouts[0], layouts[-1]],
+        "seeds": sorted({row["seed"] for row in rows}),
+        "counts": {name: {"count": int(hits), "of": of} for name, hits, of, _ in counts(rows)},
+        "columns": ["layout", "seed", "retrieved", "actions", "looks", "why"],
+        "rows": [
+            [row["layout"], row["seed"], row["retrieved"], row.get("actions"), len(row["steps"]), row["why"]]
+            for row in sorted(rows, key=lambda row: (row["layout"], row["seed"]))
+        ],
+    }
 
 
 def _wrong(step):

@@ -24,8 +24,9 @@ from mechsearch_jax.runtime.files import PathLike
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
-# Runs of the default: true shapes and images, other worlds, and household things. Fields of the page have their names.
-RUNS = ("report-i-h200", "report-i-worlds-h200", "report-household-bases-h200")
+# Runs of the default: true shapes and images, other worlds, household things, and what the other worlds are compared
+# with. Fields of the page have their names.
+RUNS = ("report-h200", "report-i-worlds-h200", "report-household-bases-h200", "report-i-h200")
 # What of a simulated world differs from what the planner assumes, by its name on the page.
 WORLDS: Mapping[str, Mapping[str, float]] = {
     "friction and mass of each body half to twice": {"mismatch.friction_spread": 2.0, "mismatch.mass_spread": 2.0},
@@ -149,6 +150,35 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
+# What `tests/own_cell` counts, by its name on the page.
+OWN_CELL: Mapping[str, str] = {
+    "target dropped": "searches in which the held target was dropped",
+    "motions without gain": "motions without expected gain",
+    "refused by a controller": "files that a controller would refuse",
+    "stopped by it": "motions stopped by the controller",
+    "unannounced contacts": "motions with an unannounced contact above 5 N",
+}
+
+
+def own_cell(stored: Stored) -> str:
+    """The table of searches in a cell that is not ours."""
+    lines = []
+    for searches in stored["own-cell-cpu"]["searches"].values():
+        counts, (first, last) = searches["counts"], searches["layouts"]
+        won = [row[2] for row in searches["rows"]]
+        low, high = share_interval(won, [str(row[0]) for row in searches["rows"]])
+        lines.append(
+            [
+                f"{searches['target']}, {searches['arm']}",
+                f"{first} to {last}",
+                f"{sum(won)} of {len(won)} ({low:.2f} to {high:.2f})",
+                counts["motions without expected gain"]["of"],
+                *(counts[name]["count"] for name in OWN_CELL.values()),
+            ]
+        )
+    return table(["target, arm", "layouts", "retrieved", "motions", *OWN_CELL], lines)
+
+
 # Figures of `bench real` on the page.
 REAL = ("matched", "matched well", "split", "phantoms", "90th percentile, mm", "rays through, %", "stand raised")
 
@@ -204,7 +234,7 @@ def _change(after: Sequence[EpisodeRow], before: Sequence[EpisodeRow]) -> dict[s
     }
 
 
-def default_rates(today: StoredRun, worlds: StoredRun, household: StoredRun) -> dict[str, Any]:
+def default_rates(today: StoredRun, worlds: StoredRun, household: StoredRun, assumed: StoredRun) -> dict[str, Any]:
     """The fields of the template about what the default reaches."""
     true, full = _with_settings(today), _with_settings(today, recognition="full")
     other = {name: _with_settings(worlds, **differing) for name, differing in WORLDS.items()}
@@ -212,13 +242,13 @@ def default_rates(today: StoredRun, worlds: StoredRun, household: StoredRun) -> 
         "true shapes": _with_settings(household),
         "`full-parts`": _with_settings(household, recognition="full-parts"),
     }
-    changes = {name: _change(rows, true) for name, rows in other.items()}
+    changes = {name: _change(rows, _with_settings(assumed)) for name, rows in other.items()}
     return {
         "default_rates": rates("seen", {"true shapes": _episodes(true), "`full`": _episodes(full)}),
         "mishaps": mishaps(
             {
-                "`report-i`, true shapes": _episodes(true),
-                "`report-i`, `full`": _episodes(full),
+                "`report`, true shapes": _episodes(true),
+                "`report`, `full`": _episodes(full),
                 "`report-i`, friction and mass not as assumed": _episodes(next(iter(other.values()))),
                 "`report-household`, `full-parts`": _episodes(things["`full-parts`"]),
             }
@@ -229,14 +259,13 @@ def default_rates(today: StoredRun, worlds: StoredRun, household: StoredRun) -> 
             ["world", "pairs", "change of retrieved, points", "with 2, 4, 6, 8 objects"],
             [[name, change["pairs"], change["all"], change["each"]] for name, change in changes.items()],
         ),
-        "batch_decision": 1000 * sum(row.planning_seconds for row in true) / sum(row.steps for row in true),
     }
 
 
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template that are no values of a file."""
     runs = [load_run(stored.folder / "runs", name) for name in RUNS]
-    planned, searched = stored["plan-farther-sides-batch-h200"], stored["searcher-h200"]["rows"]
+    planned = stored["plan-batch-h200"]
     starts = stored["scenes-start-cpu"]["summary"]
     return {
         **{name.rpartition("-")[0].replace("-", "_"): run.lines[0] for name, run in zip(RUNS, runs, strict=True)},
@@ -246,9 +275,7 @@ def computed(stored: Stored) -> dict[str, Any]:
         "real": real_images(stored),
         "real_kinds": real_kinds(stored),
         "at_once": planned["shapes"]["batch"] / planned["median_seconds"],
-        "searches": len(searched),
-        "searcher_retrieved": sum(row[3] for row in searched),
-        "episodes_retrieved": sum(row[1] for row in searched),
+        "own_cell": own_cell(stored),
         "starts": sum(each["scenes"] for each in starts),
         "starts_ruled_out": sum(each["truth_ruled_out"] for each in starts),
         "in_sight": sum(
