@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.benchmarks.lab import __main__ as lab
+from mechsearch_jax.benchmarks.lab.commands import quality
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.store.rows import EpisodeRow, write_rows
 from mechsearch_jax.commands import main as cli
@@ -164,7 +165,7 @@ def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, caps
 
 
 def test_what_a_checkout_alone_has_is_refused_with_the_way_there():
-    assert sorted(cli.IN_A_CHECKOUT) == sorted(lab.COMMANDS)
+    assert sorted(cli.IN_A_CHECKOUT) == sorted(quality.COMMANDS)
     for name in cli.IN_A_CHECKOUT:
         with pytest.raises(InputError, match=f"run `python -m mechsearch_jax.benchmarks.lab {name}` in one"):
             cli.parse(["bench", name, "--help"])

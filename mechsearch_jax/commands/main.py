@@ -73,7 +73,7 @@ GROUPS: Mapping[str, Commands] = {
     "bench": bench.COMMANDS,
 }
 # What only a checkout has: benchmarks/lab, once commands of `mechsearch bench`.
-IN_A_CHECKOUT = ("agreement", "ceiling", "cell", "push", "recognition", "scenes", "segmentation", "sensors")
+IN_A_CHECKOUT = ("agreement", "push", "recognition", "scenes", "segmentation", "sensors")
 
 
 # Complete option types, which take a second to make, by the type in a command's signature.
