@@ -74,9 +74,12 @@ def test_the_pictures_are_of_searches_by_the_decisions_of_today(name):
     assert (SEARCHED[name]["scene"], SEARCHED[name]["decisions"]) == (scene, DECISION_VERSION), DRAW_PICTURES
 
 
+# Random actions are others wherever a number is rounded otherwise.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", pictures.SEARCHES)
-def test_a_search_ends_today_as_its_pictures_say(name, tmp_path):
+@pytest.mark.parametrize("name", sorted({*pictures.SEARCHES} - {"random"}))
+def test_a_search_ends_today_as_its_pictures_say(name, tmp_path, monkeypatch):
+    # As a user has it: these tests compile for speed of compilation.
+    monkeypatch.setenv("XLA_FLAGS", "")
     folder = pictures.search(name, tmp_path)
     assert pictures.record_of(folder) == SEARCHED[name], DRAW_PICTURES
 
