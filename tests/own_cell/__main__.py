@@ -47,9 +47,9 @@ def main():
     print(summary.table(kept))
     (given.out / f"summary-{given.target}-{given.arm}.md").write_text(summary.table(kept) + "\n")
     if given.store:
-        told = json.loads(given.store.read_text()) if given.store.exists() else {"searches": {}}
-        told["searches"][f"{given.target} on {given.arm}"] = summary.stored(kept)
-        given.store.write_text(json.dumps(told, indent=1) + "\n")
+        results = json.loads(given.store.read_text()) if given.store.exists() else {"searches": {}}
+        results["searches"][f"{given.target} on {given.arm}"] = summary.stored(kept)
+        given.store.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

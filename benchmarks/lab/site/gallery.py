@@ -78,9 +78,9 @@ def draw(episode: Shown, out: Path, recordings: Path) -> Path:
     """
     page, folder = out / f"{episode.name}.html", recordings / episode.name
     if not (folder / NAME).is_file():
-        _run("search", *episode.search, "--out", str(folder), "--record")
+        mechsearch("search", *episode.search, "--out", str(folder), "--record")
     with tempfile.TemporaryDirectory() as fresh:
-        _run("view", str(folder), "--save", str(Path(fresh) / "page.html"))
+        mechsearch("view", str(folder), "--save", str(Path(fresh) / "page.html"))
         content = (Path(fresh) / "page.html").read_bytes()
     if len(content) > LARGEST:
         raise InputError(f"{episode.name}: its page has {len(content)} bytes, more than {LARGEST}")
@@ -89,7 +89,7 @@ def draw(episode: Shown, out: Path, recordings: Path) -> Path:
     return page
 
 
-def _run(*command: str) -> None:
+def mechsearch(*command: str) -> None:
     """Run a command of `mechsearch`.
 
     Raises:

@@ -10,8 +10,6 @@ import argparse
 import itertools
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -60,7 +58,6 @@ FILMS: Mapping[str, str] = {"planner": "search-for-grasp", "random": "random act
 WIDTH, FPS, SPEED, TITLE = 720, 8, 5.0, 0.3
 # Steps of the search that are shown, at most, and the width of one [inch].
 STEPS, _WIDTH = 6, 3.6
-_PROGRAM = (sys.executable, "-m", "mechsearch_jax.commands.main")
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
@@ -71,9 +68,9 @@ def search(name: str, recordings: Path) -> Path:
     Raises:
       InputError: the search fails.
     """
-    folder, command = recordings / name, ("search", *SEARCHES[name], "--out", str(recordings / name), "--record")
-    if not (folder / NAME).is_file() and (code := subprocess.run([*_PROGRAM, *command]).returncode):
-        raise InputError(f"mechsearch {' '.join(command)} ended with {code}")
+    folder = recordings / name
+    if not (folder / NAME).is_file():
+        gallery.mechsearch("search", *SEARCHES[name], "--out", str(folder), "--record")
     return folder
 
 
